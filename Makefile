@@ -1,0 +1,98 @@
+# Sets everything up in .venv and bakes, tests, benchmarks or lints with the wheel of this tree.
+#
+#   make [bake] [ENV=image] [OUT=folder] [ARGS='--size 512 ...']     bakes the demo or your environment
+#   make test | test-all [ARGS='-k name']                            test-all: those that take minutes too
+#   make bench | lint | devices | clean
+
+# `=`, not `?=`: a variable ENV of the shell means something else.
+ENV = demo
+OUT = baked
+ARGS =
+PYTHON = python3
+
+VENV := .venv
+BIN := $(VENV)/bin
+WHEEL = $$(ls $(VENV)/wheel/*.whl)
+# Folders too: theirs is the time that changes when a file goes.
+SOURCES := setup.cfg pyproject.toml LICENSE $(wildcard README.md) \
+  $(shell find host kernels -name __pycache__ -prune -o -name '*.egg-info' -prune -o -print)
+
+# A recipe is one script that stops at its first failure.
+.ONESHELL:
+.SHELLFLAGS = -ec
+.DELETE_ON_ERROR:
+.PHONY: bake test test-all bench lint devices clean
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+# What is tested is the wheel, whatever the caller's shell has on its path.
+unexport PYTHONPATH
+
+bake: $(VENV)/device.done
+	@$(BIN)/whitefurnace bake "$(ENV)" -o "$(OUT)" $(ARGS)
+
+test: $(VENV)/device.done $(VENV)/test.done
+	@$(BIN)/pytest -m "not long" $(ARGS) tests
+
+test-all: $(VENV)/device.done $(VENV)/test.done
+	@$(BIN)/pytest $(ARGS) tests
+
+bench: $(VENV)/device.done $(VENV)/test.done
+	@for file in benchmarks/*.py; do $(BIN)/python "$$file" $(ARGS); done
+
+lint: $(VENV)/lint.done
+	@$(BIN)/ruff check .
+	$(BIN)/mypy
+
+devices: $(VENV)/installed.done
+	@$(BIN)/whitefurnace devices
+
+clean:
+	@rm -rf $(VENV) build host/*.egg-info .pytest_cache .mypy_cache .ruff_cache
+
+$(VENV)/created.done:
+	@echo "Making $(VENV)."
+	$(PYTHON) -m venv $(VENV) || {
+		echo "No virtual environment could be made: install Python's venv (Debian: apt install python3-venv)."
+		exit 1
+	} >&2
+	touch $@
+
+# The folder build/ of an earlier wheel would bring deleted modules back.
+$(VENV)/installed.done: $(VENV)/created.done $(SOURCES)
+	@echo "Installing whitefurnace."
+	rm -rf build host/*.egg-info $(VENV)/wheel
+	$(BIN)/pip wheel --quiet --no-deps --wheel-dir $(VENV)/wheel .
+	rm -rf build host/*.egg-info
+	$(BIN)/pip install --quiet "$(WHEEL)"
+	$(BIN)/pip install --quiet --no-deps --force-reinstall "$(WHEEL)"
+	touch $@
+
+$(VENV)/test.done $(VENV)/lint.done: $(VENV)/%.done: setup.cfg | $(VENV)/installed.done
+	@$(BIN)/pip install --quiet "$(WHEEL)[$*]"
+	touch $@
+
+# A device that is listed is not one that works, so each source of one is tried and asked; once.
+$(VENV)/device.done: $(VENV)/installed.done
+	@works() { $(BIN)/whitefurnace devices >/dev/null 2>&1; }
+	if ! works; then
+		echo "No OpenCL device works yet; trying PoCL from PyPI."
+		$(BIN)/pip install --quiet pocl-binary-distribution || true
+		works || $(BIN)/pip uninstall --quiet --yes pocl-binary-distribution || true
+	fi
+	if ! works && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+		echo "None works yet; trying Debian's PoCL."
+		export DEBIAN_FRONTEND=noninteractive
+		apt-get -qq update || true
+		apt-get -qq install --yes --no-install-recommends pocl-opencl-icd >/dev/null || true
+	fi
+	if ! works; then
+		echo "None works yet; trying Intel's OpenCL runtime from PyPI (0.9 GB, Intel's own licence)."
+		$(BIN)/pip install --quiet intel-opencl-rt intel-cmplr-lib-rt || true
+		works || $(BIN)/pip uninstall --quiet --yes intel-opencl-rt intel-cmplr-lib-rt || true
+	fi
+	if ! works; then
+		$(BIN)/whitefurnace devices || true
+		echo "No OpenCL device works: install a GPU vendor's driver or PoCL (Debian: apt install pocl-opencl-icd)"
+		echo "and run make again."
+		exit 1
+	fi >&2
+	touch $@

@@ -1,0 +1,1 @@
+"""whitefurnace: integrates BRDFs on OpenCL devices and bakes image-based lighting with a stated error."""

@@ -1,0 +1,1 @@
+"""Entries of the slot `fresnel`: one module a model, with `ENTRY`."""

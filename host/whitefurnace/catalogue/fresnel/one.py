@@ -1,0 +1,14 @@
+"""No Fresnel term: F = 1."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model
+
+ENTRY = Model(
+    slot="fresnel",
+    name="one",
+    title="None (F = 1)",
+    citation="Hoffman2012",
+    parameters=(),
+    provides=("FRESNEL_F",),
+    reference={"F": lambda cos_d: np.ones_like(np.asarray(cos_d, np.float64))},
+)

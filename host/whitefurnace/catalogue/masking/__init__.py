@@ -1,0 +1,1 @@
+"""Entries of the slot `masking`: one module a model, with `ENTRY`."""

@@ -1,0 +1,72 @@
+"""What a catalogue entry says of a model, a parameter, an integral."""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.errors import UsageError
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a model: its domain validates input, its typical values feed tests and help."""
+
+    name: str
+    symbol: str
+    unit: str
+    low: float
+    high: float
+    typical: tuple[float, ...]
+    about: str
+    default: float | None = None
+
+    def check(self, values: Any, where: str) -> np.ndarray:
+        """`values` as float64, or UsageError when one lies outside [low, high] or is not finite."""
+        try:
+            array = np.asarray(values, np.float64)
+        except (TypeError, ValueError):
+            raise UsageError(f"{where}: {self.name} must be a number, not {values!r}") from None
+        bad = ~((array >= self.low) & (array <= self.high))  # also catches NaN
+        if bad.any():
+            raise UsageError(f"{where}: {self.name} = {array[bad].flat[0]:g} is outside "
+                             f"[{self.low:g}, {self.high:g}] ({self.about})")
+        return array
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model of a slot. `provides` and `needs` name kernel functions as SLOT_FUNCTION (`NDF_D`)."""
+
+    slot: str
+    name: str
+    title: str
+    citation: str
+    parameters: tuple[Parameter, ...]
+    provides: tuple[str, ...]
+    reference: Mapping[str, Callable[..., Any]]
+    """Float64 references by function name, written in another form than the kernel."""
+    needs: tuple[str, ...] = ()
+    isotropic: bool = True
+    from_roughness: Callable[[float], dict[str, float]] | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def kernel_file(self) -> str:
+        return f"{self.slot}/{self.name}.clh"
+
+
+@dataclass(frozen=True)
+class Integral:
+    """An integral of the catalogue: `integrand/NAME.clh` under the rule that fits its support."""
+
+    name: str
+    title: str
+    components: int
+    needs: tuple[str, ...]
+    half_angle: bool
+    view: bool
+    about: str
+    component_names: tuple[str, ...] = ()

@@ -1,0 +1,1 @@
+"""Entries of the slot `ndf`: one module a model, with `ENTRY`."""

@@ -1,0 +1,56 @@
+"""The entries, found in the folders and looked up by name."""
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+
+from whitefurnace.catalogue.model import Integral, Model
+from whitefurnace.errors import UsageError, nearest
+
+SLOTS = ("ndf", "masking", "fresnel")
+
+
+@cache
+def models(slot: str) -> dict[str, Model]:
+    """All models of a slot by name. Raises UsageError for an unknown slot."""
+    if slot not in SLOTS:
+        raise UsageError(f"unknown slot {slot!r}{nearest(slot, SLOTS)}")
+    package = importlib.import_module(f"whitefurnace.catalogue.{slot}")
+    found = {}
+    for info in pkgutil.iter_modules(package.__path__):
+        entry: Model = importlib.import_module(f"{package.__name__}.{info.name}").ENTRY
+        found[entry.name] = entry
+    return found
+
+
+def model(slot: str, name: str) -> Model:
+    """The model `name` of `slot`. Raises UsageError with the nearest name."""
+    known = models(slot)
+    if name not in known:
+        raise UsageError(f"unknown {slot} {name!r}{nearest(name, known)}")
+    return known[name]
+
+
+INTEGRALS = {
+    entry.name: entry
+    for entry in (
+        Integral("normalization", "NDF normalization", 1, ("NDF_D",), False, False,
+                 "∫ D(m)(n·m) dω over the hemisphere; 1 for a normalized NDF"),
+        Integral("projected_area", "Projected area", 1, ("NDF_D",), False, True,
+                 "A(v) = ∫ D(m)(v·m)₊ dω"),
+        Integral("weak_furnace", "Weak white furnace", 1, ("NDF_D", "MASKING_G1"), False, True,
+                 "∫ D(m) G1(v)(v·m)₊ dω / (n·v); 1 where the masking fits the NDF"),
+        Integral("albedo", "Directional albedo", 1, ("NDF_D", "MASKING_G", "FRESNEL_F"), True, True,
+                 "E(v) = ∫ f(l, v)(n·l) dω"),
+        Integral("dfg", "Split-sum pair", 2, ("NDF_D", "MASKING_G"), True, True,
+                 "(A, B) with E(v; F0) = F0·A + B, Schlick's F with F90 = 1", ("scale", "bias")),
+    )
+}
+
+
+def integral(name: str) -> Integral:
+    """The integral `name`. Raises UsageError with the nearest name."""
+    if name not in INTEGRALS:
+        raise UsageError(f"unknown integral {name!r}{nearest(name, INTEGRALS)}")
+    return INTEGRALS[name]

@@ -1,0 +1,415 @@
+"""What a baked light comes from: an image, six faces or an array, checked and brought into one of two shapes
+(a lat-long, or a cube in the GL-direct layout) with its statistics."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import FileError, InputError, UsageError
+from whitefurnace.files import decode_srgb, read_image
+
+FACES = ("+X", "-X", "+Y", "-Y", "+Z", "-Z")
+FACE_NAMES = (
+    ("px", "nx", "py", "ny", "pz", "nz"),
+    ("posx", "negx", "posy", "negy", "posz", "negz"),
+    ("right", "left", "top", "bottom", "front", "back"),
+)
+
+
+class Cell(NamedTuple):
+    """Where a face lies in an image: `turns` quarter turns counter-clockwise bring it upright."""
+
+    column: int
+    row: int
+    turns: int = 0
+
+
+class Layout(NamedTuple):
+    """`columns` : `rows` is the aspect ratio that tells a layout; `cells` are those of +X -X +Y -Y +Z -Z,
+    none for a lat-long."""
+
+    name: str
+    columns: int
+    rows: int
+    cells: tuple[Cell, ...] = ()
+
+
+# Faces are seen from inside, upright as in GL-direct, and cross faces join at the edges they share on the
+# sphere: +Z is in the middle with +Y above it. In a vertical cross -Z hangs below -Y, upside down.
+LAYOUTS = (
+    Layout("latlong", 2, 1),
+    Layout(
+        "horizontal cross", 4, 3, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(3, 1))
+    ),
+    Layout(
+        "vertical cross", 3, 4, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(1, 3, 2))
+    ),
+    Layout("horizontal strip", 6, 1, tuple(Cell(face, 0) for face in range(6))),
+    Layout("vertical strip", 1, 6, tuple(Cell(0, face) for face in range(6))),
+)
+_CHANNELS = "RGBA"
+_BLOCK = 1 << 18  # texels looked at together: a few MB in float64
+_BRIGHTEST = 64
+_FLOAT_MAX = np.finfo(np.float32).max
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Radiance from every direction, linear Rec.709, piecewise constant over `texels`.
+
+    texels      float32, C-contiguous: "latlong" (h, w, 3), row 0 at +Y, u = atan2(z, x)/2pi + 1/2 from left
+                to right; "cube" (6, n, n, 3), GL-direct: +X -X +Y -Y +Z -Z, rows top-down
+    coverage    the fourth channel, float32 (h, w) or (6, n, n) in [0, 1]; None where it is 1 everywhere
+    rotation    radians in [-pi, pi] that the azimuth atan2(z, x) of everything is still to be increased by
+    exposure    EV that `texels` have been multiplied with already
+    name        stem of the source
+    layout      how it was placed: a name of `LAYOUTS`, "six faces" or "cube" (an array of six faces)
+    digest      sha256 hex of the source's bytes; options are not in it
+    notices     sentences about what was converted, clamped or left out
+    statistics  width, height (texels, of one face for a cube); mean (R, G, B) over the sphere; maximum, of
+                the mean of a texel's channels, and max_over_mean, its ratio to the mean (1 for black);
+                brightest, the direction (x, y, z) of that texel, rotation included; brightest_share, in
+                [0, 1], the share of the energy in the 64 texels with the most (0 for black)
+    """
+
+    kind: Literal["latlong", "cube"]
+    texels: npt.NDArray[np.float32]
+    coverage: npt.NDArray[np.float32] | None
+    rotation: float
+    name: str
+    layout: str
+    digest: str
+    exposure: float = 0.0
+    notices: tuple[str, ...] = ()
+    statistics: dict[str, Any] = field(default_factory=dict)
+
+
+def latlong_solid_angles(height: int, width: int) -> npt.NDArray[np.float64]:
+    """Steradians of one texel in each row of a lat-long, (height,): (2 pi/w)(cos th0 - cos th1)."""
+    centre = (np.arange(height) + 0.5) * (math.pi / height)
+    # As a product of sines: the difference of cosines cancels at the poles.
+    return (2 * math.pi / width) * 2 * np.sin(centre) * math.sin(0.5 * math.pi / height)
+
+
+def cube_solid_angles(size: int) -> npt.NDArray[np.float64]:
+    """Steradians of the texels of one cube face, (size, size): differences over the corners of
+    atan(x y / sqrt(1 + x^2 + y^2)), the solid angle between the face's centre and (x, y)."""
+    edge = np.arange(size + 1) * (2 / size) - 1
+    x, y = edge[None, :], edge[:, None]
+    corner = np.arctan(x * y / np.sqrt(1 + x * x + y * y))
+    return np.diff(np.diff(corner, axis=0), axis=1)
+
+
+def environment(
+    source: str | os.PathLike[str] | npt.NDArray[Any] | Environment,
+    *,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: Literal["refuse", "zero"] = "refuse",
+) -> Environment:
+    """The environment of an image file, a folder of six faces, an array or another environment.
+
+    source     an image in one of `LAYOUTS` (a 1 x 1 image is a constant); a folder with six square images
+               named px nx py ny pz nz, posx negx ... or right left top bottom front back (front is +Z); an
+               array (h, w) or (h, w, 1 | 3 | 4) of such an image, or (6, n, n) or (6, n, n, 1 | 3 | 4), of
+               floats (linear Rec.709) or uint8 or uint16 (sRGB)
+    rotate     degrees about +Y that increase the azimuth atan2(z, x) of everything; pixels are not resampled
+    exposure   EV in [-64, 64]: radiance is multiplied by 2**exposure
+    nonfinite  "refuse" NaN, inf and negative values, or make them "zero" and say so in `notices`
+
+    Raises `UsageError` for an option out of its domain, `FileError` for what cannot be read, and `InputError`
+    for what was read and is not an environment.
+    """
+    if not _is_number(rotate):
+        raise UsageError(f"rotate is {rotate!r}, a finite angle in degrees was expected")
+    if not _is_number(exposure) or abs(exposure) > 64:
+        raise UsageError(f"exposure is {exposure!r}, a number of EV in [-64, 64] was expected")
+    if nonfinite not in ("refuse", "zero"):
+        raise UsageError(f"nonfinite is {nonfinite!r}, 'refuse' or 'zero' was expected")
+    turn = math.radians(math.remainder(rotate, 360.0))
+    zero = nonfinite == "zero"
+
+    if isinstance(source, Environment):
+        if turn == 0 and exposure == 0:
+            return source
+        found = replace(
+            source,
+            rotation=math.remainder(source.rotation + turn, 2 * math.pi),
+            texels=source.texels if exposure == 0 else source.texels.copy(),
+        )
+    elif isinstance(source, (str, os.PathLike)):
+        path = Path(source)
+        found = _from_folder(path, zero) if os.path.isdir(path) else _from_image(path, zero)
+        found = replace(found, rotation=turn)
+    elif isinstance(source, np.ndarray):
+        found = replace(_from_array(source, zero), rotation=turn)
+    else:
+        raise UsageError(
+            f"an environment cannot be made from a {type(source).__name__}, "
+            "a path, a numpy array or an Environment was expected"
+        )
+    if exposure != 0:
+        _expose(found.texels, exposure, found.name)
+        found = replace(found, exposure=found.exposure + exposure)
+    return replace(found, statistics=_statistics(found))
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
+
+
+def _from_image(path: Path, zero: bool) -> Environment:
+    image = read_image(path)
+    layout = _layout_of(image.pixels.shape, str(path))
+    notices = list(image.notices)
+    _clean(image.pixels[None], layout, str(path), zero, notices)
+    return _placed(image.pixels, layout, path.stem, image.digest, notices)
+
+
+def _from_array(array: npt.NDArray[Any], zero: bool) -> Environment:
+    where = f"the array of shape {array.shape}"
+    if array.dtype.kind != "f" and array.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{where} holds {array.dtype}, floats, uint8 or uint16 were expected")
+    digest = hashlib.sha256(f"{array.dtype.str}{array.shape}".encode())
+    digest.update(np.ascontiguousarray(array).data if array.size else b"")
+    cube = array.ndim in (3, 4) and array.shape[0] == 6 and array.shape[1] == array.shape[2]
+    if array.ndim == (3 if cube else 2):
+        array = array[..., None]
+    if array.ndim != (4 if cube else 3) or array.shape[-1] not in (1, 3, 4) or array.size == 0:
+        raise InputError(
+            f"{where} is not an environment; (h, w), (h, w, 1 | 3 | 4), (6, n, n) or "
+            "(6, n, n, 1 | 3 | 4) was expected"
+        )
+    with np.errstate(over="ignore"):  # a double over the range of float32 is found as inf
+        pixels = decode_srgb(array) if array.dtype.kind == "u" else np.array(array, np.float32, order="C")
+    notices: list[str] = []
+    if cube:
+        _clean(pixels, None, where, zero, notices)
+        return _cube(pixels, "array", "cube", digest.hexdigest(), notices)
+    layout = _layout_of(pixels.shape, where)
+    _clean(pixels[None], layout, where, zero, notices)
+    return _placed(pixels, layout, "array", digest.hexdigest(), notices)
+
+
+def _from_folder(folder: Path, zero: bool) -> Environment:
+    paths = _face_paths(folder)
+    images = []
+    notices: list[str] = []
+    size = 0
+    for path in paths:
+        image = read_image(path)
+        height, width, _ = image.pixels.shape
+        size = size or height
+        if width != height or height != size:
+            raise InputError(
+                f"{path} is {width} x {height}, but the six faces must be squares of one size"
+                + (f", here {size} x {size}" if width == height else "")
+            )
+        notices += image.notices
+        _clean(image.pixels[None], None, str(path), zero, notices)
+        images.append(image)
+    channels = 4 if any(image.pixels.shape[2] == 4 for image in images) else 3
+    cube = np.ones((6, size, size, channels), np.float32)
+    for face, image in zip(cube, images, strict=True):
+        have = image.pixels.shape[2]
+        face[..., : max(have, 3)] = image.pixels  # grey spreads over the three
+    digest = hashlib.sha256("".join(image.digest for image in images).encode()).hexdigest()
+    return _cube(cube, folder.resolve().name, "six faces", digest, notices)
+
+
+def _face_paths(folder: Path) -> list[Path]:
+    try:
+        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    except OSError as error:
+        raise FileError(f"cannot read {folder}: {error.strerror or error}") from error
+    by_stem: dict[str, list[Path]] = {}
+    for path in files:
+        by_stem.setdefault(path.stem.lower(), []).append(path)
+    names = max(FACE_NAMES, key=lambda names: sum(name in by_stem for name in names))
+    missing = [name for name in names if name not in by_stem]
+    if len(missing) == 6:
+        choices = ", or ".join(" ".join(names) for names in FACE_NAMES)
+        raise InputError(f"{folder} holds no cube faces, six square images named {choices} were expected")
+    if missing:
+        raise InputError(
+            f"{folder} lacks the cube {'faces' if len(missing) > 1 else 'face'} {', '.join(missing)}, "
+            f"all of {' '.join(names)} were expected"
+        )
+    for name in names:
+        if len(by_stem[name]) > 1:
+            both = " and ".join(path.name for path in by_stem[name])
+            raise InputError(
+                f"{folder} holds the cube face {name} more than once ({both}), one file was expected"
+            )
+    return [by_stem[name][0] for name in names]
+
+
+def _layout_of(shape: tuple[int, ...], where: str) -> Layout:
+    height, width = shape[:2]
+    if height == width == 1:
+        return LAYOUTS[0]
+    for layout in LAYOUTS:
+        if width * layout.rows == height * layout.columns:
+            return layout
+    known = ", ".join(f"{layout.name} {layout.columns}:{layout.rows}" for layout in LAYOUTS)
+    raise InputError(
+        f"{where} is {width} x {height}, an aspect ratio of {width / height:.4g} that no layout has "
+        f"({known}, or a single pixel)"
+    )
+
+
+def _cells(layout: Layout, height: int, width: int) -> Iterator[tuple[slice, slice, int]]:
+    n = width // layout.columns
+    for column, row, turns in layout.cells:
+        yield slice(row * n, (row + 1) * n), slice(column * n, (column + 1) * n), turns
+
+
+def _placed(
+    pixels: npt.NDArray[np.float32], layout: Layout, name: str, digest: str, notices: list[str]
+) -> Environment:
+    if layout.cells:
+        height, width, _ = pixels.shape
+        faces = [
+            np.rot90(pixels[rows, columns], turns) for rows, columns, turns in _cells(layout, height, width)
+        ]
+        return _cube(np.stack(faces), name, layout.name, digest, notices)
+    return _made("latlong", pixels, name, layout.name, digest, notices)
+
+
+def _cube(
+    faces: npt.NDArray[np.float32], name: str, layout: str, digest: str, notices: list[str]
+) -> Environment:
+    return _made("cube", faces, name, layout, digest, notices)
+
+
+def _made(
+    kind: Literal["latlong", "cube"],
+    pixels: npt.NDArray[np.float32],
+    name: str,
+    layout: str,
+    digest: str,
+    notices: list[str],
+) -> Environment:
+    """Split coverage from radiance and spread grey over three channels."""
+    coverage = None
+    if pixels.shape[-1] == 4:
+        if pixels[..., 3].max() > 1:
+            np.minimum(pixels[..., 3], 1, out=pixels[..., 3])
+            notices.append(f"{name}: coverage over 1 was clamped to 1")
+        if pixels[..., 3].min() < 1:
+            coverage = np.ascontiguousarray(pixels[..., 3])
+    if pixels.shape[-1] == 1:
+        pixels = np.repeat(pixels, 3, axis=-1)
+    texels = np.ascontiguousarray(pixels[..., :3])
+    return Environment(kind, texels, coverage, 0.0, name, layout, digest, notices=tuple(notices))
+
+
+def _clean(
+    faces: npt.NDArray[np.float32], layout: Layout | None, where: str, zero: bool, notices: list[str]
+) -> None:
+    """Refuse values that are NaN, inf or negative in `faces` (1 or 6, h, w, c), or make them 0 in place. What
+    no face of the layout covers does not count."""
+    if faces.min() >= 0 and faces.max() <= _FLOAT_MAX:  # false where there is a NaN
+        return
+    nonfinite, negative = ~np.isfinite(faces), faces < 0
+    negative &= ~nonfinite
+    if layout is not None and layout.cells:
+        _, height, width, _ = faces.shape
+        used = np.zeros((1, height, width, 1), bool)
+        for rows, columns, _ in _cells(layout, height, width):
+            used[:, rows, columns] = True
+        nonfinite &= used
+        negative &= used
+    for bad, what, rule, action in (
+        (nonfinite, "not finite", "radiance must be finite", "set to 0"),
+        (negative, "negative", "radiance must be at least 0", "clamped to 0"),
+    ):
+        count = int(np.count_nonzero(bad))
+        if count == 0:
+            continue
+        face, y, x, channel = (int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
+        value = faces[face, y, x, channel]
+        if not zero:
+            place = f"pixel ({x}, {y})" + (f" of face {FACES[face]}" if len(faces) == 6 else "")
+            colour = "grey" if faces.shape[-1] == 1 else _CHANNELS[channel]
+            many = "the only value" if count == 1 else f"the first of {count} values"
+            raise InputError(
+                f"{where} holds {value} in channel {colour} of {place}, {many} that "
+                f"{'is' if count == 1 else 'are'} {what}; {rule}, or --nonfinite zero has them {action}"
+            )
+        faces[bad] = 0
+        notices.append(f"{where}: {count} {what} value{' was' if count == 1 else 's were'} {action}")
+
+
+def _expose(texels: npt.NDArray[np.float32], exposure: float, name: str) -> None:
+    with np.errstate(over="ignore", under="ignore"):
+        np.multiply(texels, np.float32(2.0**exposure), out=texels)
+    if not texels.max() <= _FLOAT_MAX:
+        raise InputError(
+            f"{name} multiplied by 2^{exposure:g} is over {_FLOAT_MAX:.3g}, the range of float32; "
+            "a lower exposure is needed"
+        )
+
+
+def _statistics(env: Environment) -> dict[str, Any]:
+    height, width = env.texels.shape[-3:-1]
+    rows = env.texels.reshape(-1, width, 3)
+    if env.kind == "latlong":
+        weights = latlong_solid_angles(height, width)[:, None]
+    else:
+        weights = cube_solid_angles(height)
+    step = max(1, min(_BLOCK // width, height))
+    total = np.zeros(3)
+    brightest = np.zeros(0)
+    maximum, at = -1.0, (0, 0)
+    for face in range(len(rows) // height):
+        for first in range(0, height, step):
+            weight = weights[first : first + step]
+            start = face * height + first
+            block = rows[start : start + len(weight)].astype(np.float64)
+            weighted = block.sum(axis=2)
+            top = int(weighted.argmax())
+            if weighted.flat[top] > maximum:
+                maximum, at = float(weighted.flat[top]), (start + top // width, top % width)
+            weighted *= weight
+            total += np.einsum("ijk,ij->k", block, np.broadcast_to(weight, weighted.shape))
+            brightest = np.concatenate([brightest, weighted.ravel()])
+            if len(brightest) > _BRIGHTEST:
+                brightest = np.partition(brightest, -_BRIGHTEST)[-_BRIGHTEST:]
+    mean = total / (4 * math.pi)
+    energy, level = float(total.sum()), float(mean.sum())
+    return {
+        "width": width,
+        "height": height,
+        "mean": [float(value) for value in mean],
+        "maximum": maximum / 3,
+        "max_over_mean": maximum / level if level > 0 else 1.0,
+        "brightest": [float(value) for value in _direction(env, *at)],
+        "brightest_share": min(float(brightest.sum()) / energy, 1.0) if energy > 0 else 0.0,
+    }
+
+
+def _direction(env: Environment, row: int, column: int) -> tuple[float, float, float]:
+    """Unit vector to the centre of a texel, with the rotation; rows of a cube run through its faces."""
+    height, width = env.texels.shape[-3:-1]
+    if env.kind == "latlong":
+        polar = (row + 0.5) * math.pi / height
+        azimuth = ((column + 0.5) / width - 0.5) * 2 * math.pi
+        x, y, z = math.sin(polar) * math.cos(azimuth), math.cos(polar), math.sin(polar) * math.sin(azimuth)
+    else:
+        face, row = divmod(row, height)
+        s, t = (2 * column + 1) / width - 1, (2 * row + 1) / height - 1
+        x, y, z = ((1, -t, -s), (-1, -t, s), (s, 1, t), (s, -1, -t), (s, -t, 1), (-s, -t, -1))[face]
+        norm = math.sqrt(x * x + y * y + z * z)
+        x, y, z = x / norm, y / norm, z / norm
+    c, s = math.cos(env.rotation), math.sin(env.rotation)
+    return x * c - z * s, y, x * s + z * c

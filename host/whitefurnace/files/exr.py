@@ -1,0 +1,109 @@
+"""Writes float32 OpenEXR files and proves, before they take their name, that they hold what was given."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import FileError
+from whitefurnace.files.atomic import write_atomic
+
+
+def write_exr(
+    path: str | os.PathLike[str],
+    pixels: npt.NDArray[np.float32],
+    *,
+    channel_names: Sequence[str] = ("R", "G", "B"),
+    attributes: Mapping[str, str | float | int] | None = None,
+) -> None:
+    """Write `pixels` (height, width, channels) as 32-bit floats, ZIP compressed: half would turn values over
+    65504 into inf in silence. The same input gives the same bytes, with no time in them.
+
+    `channel_names` has one name a channel. The file is read back and compared bit for bit before it is
+    renamed. Raises `FileError` for what cannot be written, a full disk too.
+    """
+    path = Path(path)
+    pixels = np.ascontiguousarray(pixels, np.float32)
+    if pixels.ndim != 3 or pixels.shape[2] != len(channel_names):
+        raise ValueError(
+            f"pixels of shape {pixels.shape} do not have one channel a name of {tuple(channel_names)}"
+        )
+
+    def write(temporary: Path) -> None:
+        # Tried first for the system's own reason, which OpenImageIO does not pass on.
+        with open(temporary, "wb"):
+            pass
+        try:
+            complaint = _write(temporary, pixels, channel_names, attributes or {})
+            if complaint is None and not _holds(temporary, pixels):
+                complaint = "what was written does not read back, the disk may be full"
+        except UnicodeError as error:
+            raise FileError(
+                f"cannot write {str(path)!r}: its name or an attribute is not valid Unicode"
+            ) from error
+        if complaint is not None:
+            raise FileError(f"cannot write {path}: {complaint}")
+
+    write_atomic(path, write)
+
+
+def _write(
+    path: Path,
+    pixels: npt.NDArray[np.float32],
+    names: Sequence[str],
+    attributes: Mapping[str, str | float | int],
+) -> str | None:
+    """None, or what went wrong. On return the output object is gone: only its destructor completes some
+    files."""
+    import OpenImageIO as oiio
+
+    height, width, channels = pixels.shape
+    spec = oiio.ImageSpec(width, height, channels, "float")
+    spec.channelnames = tuple(names)
+    spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # empty is left out; absent, OpenImageIO writes the time of day
+    for name, value in attributes.items():
+        spec.attribute(name, value)
+    # By format: the temporary's suffix says nothing.
+    output = oiio.ImageOutput.create("openexr")
+    if output is None:
+        return _first_line(oiio.geterror())
+    done = output.open(str(path), spec) and output.write_image(pixels)
+    complaint = output.geterror()
+    closed = output.close()
+    complaint = complaint or output.geterror()
+    del output
+    complaint = complaint or oiio.geterror()
+    return None if done and closed and not complaint else _first_line(complaint)
+
+
+def _holds(path: Path, pixels: npt.NDArray[np.float32]) -> bool:
+    import OpenImageIO as oiio
+
+    source = oiio.ImageInput.open(str(path))
+    if source is None:
+        oiio.geterror()
+        return False
+    back = source.read_image(0, 0, 0, pixels.shape[2], "float")
+    failed = source.has_error
+    source.geterror()
+    source.close()
+    if back is None or failed:
+        return False
+    back = np.ascontiguousarray(back, np.float32)
+    return back.size == pixels.size and bool(
+        np.array_equal(back.view(np.uint32).ravel(), pixels.view(np.uint32).ravel())
+    )
+
+
+def _first_line(complaint: str) -> str:
+    lines = complaint.strip().splitlines()
+    return (
+        " ".join(lines[0].split())[:160].rstrip(".")
+        if lines
+        else "OpenImageIO gave no reason, the disk may be full"
+    )

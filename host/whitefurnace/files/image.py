@@ -1,0 +1,352 @@
+"""Reads one image of any format OpenImageIO knows into linear Rec.709 float32, and turns whatever is wrong
+with it (missing, truncated, corrupted, lying about its size) into one sentence."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import FileError, InputError
+from whitefurnace.files.atomic import digest_file
+from whitefurnace.files.integrity import check_file
+
+MAX_PIXELS = 32768 * 16384
+MAX_SIDE = 65536
+_CHUNK_BYTES = 8 << 20
+# The densest coding of flat TIFF, PNG and JPEG images is near 1365 : 1 (LZW); a header that claims more lies.
+_MAX_RATIO = 2000
+# `null` makes up an image from a file's name, `zfile` holds depth.
+_NOT_IMAGES = ("null", "zfile", "term")
+_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image as read. `pixels` is float32 (height, width, channels), row 0 on top, channels 1 (grey), 3
+    (RGB) or 4 (RGB and coverage), linear Rec.709 radiance; `digest` the sha256 of the file's bytes in hex;
+    `format` OpenImageIO's name of the format; `notices` sentences about what was converted or left out."""
+
+    pixels: npt.NDArray[np.float32]
+    path: Path
+    digest: str
+    format: str
+    notices: tuple[str, ...] = ()
+
+
+@cache
+def srgb_table(dtype: str) -> npt.NDArray[np.float32]:
+    """Linear value of every code of an sRGB-encoded `dtype` ("uint8" or "uint16"): float32 (256,) or
+    (65536,)."""
+    top = np.iinfo(dtype).max
+    encoded = np.arange(top + 1, dtype=np.float64) / top
+    # IEC 61966-2-1: a linear toe below 0.04045, a power of 2.4 above.
+    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+    return linear.astype(np.float32)
+
+
+def decode_srgb(
+    codes: npt.NDArray[Any], out: npt.NDArray[np.float32] | None = None
+) -> npt.NDArray[np.float32]:
+    """Decode uint8 or uint16 `codes` (..., 1 | 3 | 4) from sRGB to linear float32; a fourth channel is
+    divided by its largest code instead. `out` takes the result where given."""
+    if out is None:
+        out = np.empty(codes.shape, np.float32)
+    np.take(srgb_table(codes.dtype.name), codes[..., :3], out=out[..., :3], mode="clip")
+    if codes.shape[-1] == 4:
+        np.divide(codes[..., 3], np.float32(np.iinfo(codes.dtype).max), out=out[..., 3])
+    return out
+
+
+def read_image(path: str | os.PathLike[str]) -> Image:
+    """Read an image as linear Rec.709 float32.
+
+    8- and 16-bit integers are decoded from sRGB (a fourth channel is not), floats are taken as linear; an EXR
+    or HDR with other primaries is converted, with Bradford adaptation of its white. Extra channels are left
+    out with a notice. Raises `FileError` for what cannot be opened and `InputError` for what is not a valid
+    image of 1, 3 or 4 channels with at most 32768 x 16384 pixels and 65536 a side.
+    """
+    path = Path(path)
+    size = _regular_size(path)
+    if size == 0:
+        raise InputError(f"{path} is empty, an image file was expected")
+    digest = digest_file(path)
+    try:
+        return _read(path, size, digest)
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+    except UnicodeError as error:  # channel names and the like
+        raise InputError(f"{path} is corrupted: its header holds text that is not UTF-8") from error
+    except MemoryError as error:
+        raise InputError(f"{path} needs more memory than this machine gives") from error
+
+
+def _regular_size(path: Path) -> int:
+    try:
+        status = os.stat(path)
+        if stat.S_ISDIR(status.st_mode):
+            raise FileError(f"cannot read {path}: it is a folder, an image file was expected")
+        if not stat.S_ISREG(status.st_mode):
+            raise FileError(f"cannot read {path}: it is not a regular file")
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:  # a NUL or a lone surrogate in the name
+        raise FileError(f"cannot read {str(path)!r}: {error}") from error
+    return status.st_size
+
+
+def _read(path: Path, size: int, digest: str) -> Image:
+    import OpenImageIO as oiio
+
+    notices: list[str] = []
+    with open(path, "rb") as file:
+        head = file.read(4096)
+    check_file(path, size, head, notices)
+
+    # Values as stored: coverage is kept beside the colour, not multiplied into it.
+    hints = oiio.ImageSpec()
+    hints.attribute("oiio:UnassociatedAlpha", 1)
+    try:
+        source = oiio.ImageInput.open(str(path), hints)
+    except UnicodeError as error:
+        raise FileError(f"cannot read {str(path)!r}: its name is not valid Unicode") from error
+    complaint = _complaint(oiio)  # left there, it is printed at exit
+    if source is None:
+        if "could not find a format reader" in complaint or not complaint:
+            raise InputError(
+                f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG"
+            )
+        raise InputError(f"{path} is not a valid image: {_reason(complaint, path)}")
+    try:
+        return _decode(source, path, size, digest, head, notices)
+    finally:
+        source.close()
+        _complaint(source)
+
+
+def _decode(source: Any, path: Path, size: int, digest: str, head: bytes, notices: list[str]) -> Image:
+    spec = source.spec()
+    form = source.format_name()
+    if form in _NOT_IMAGES:
+        raise InputError(f"{path} is a file of kind {form}, an image of radiance was expected")
+    _check_size(spec, path, size, form)
+    picks = _pick_channels(list(spec.channelnames), path, form, notices)
+    pixel = str(spec.format)
+    # Channels of an EXR may differ in type; what is read is the first one's, which `read` converts to.
+    if pixel not in ("uint8", "uint16", "half", "float", "double"):
+        raise InputError(
+            f"{path} has pixels of type {pixel}, 8- or 16-bit unsigned integers or floats were expected"
+        )
+    pixels = _read_pixels(source, spec, picks, path, pixel)
+    if source.has_error:  # JPEG says so here when it filled the missing part with grey
+        raise InputError(f"{path} is truncated or corrupted: {_reason(_complaint(source), path)}")
+
+    colour_space = str(spec.get_string_attribute("oiio:ColorSpace"))
+    if pixel in ("uint8", "uint16") and form != "pnm" and colour_space and "srgb" not in colour_space.lower():
+        notices.append(
+            f"{path}: states the colour space {colour_space}, its integers were decoded as sRGB all the same"
+        )
+    stated = spec.get_float_attribute("hdr:exposure", 1.0)
+    if form == "hdr" and stated != 1.0:
+        notices.append(f"{path}: states EXPOSURE={stated:g}, which was not applied")
+    if int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
+        notices.append(
+            f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read"
+        )
+    primaries = _primaries(spec, form, head)
+    if primaries is not None and pixels.shape[2] >= 3:
+        _to_rec709(pixels, primaries, path, notices)
+    pixels = _upright(pixels, spec.get_int_attribute("Orientation", 1))
+    return Image(pixels, path, digest, form, tuple(notices))
+
+
+def _check_size(spec: Any, path: Path, size: int, form: str) -> None:
+    width, height = spec.width, spec.height
+    if spec.deep:
+        raise InputError(f"{path} is a deep image, a flat one was expected")
+    if spec.depth > 1:
+        raise InputError(f"{path} is a volume of {spec.depth} slices, a flat image was expected")
+    if width < 1 or height < 1:
+        raise InputError(f"{path} states a size of {width} x {height}, each side must be at least 1")
+    if max(width, height) > MAX_SIDE or width * height > MAX_PIXELS:
+        raise InputError(
+            f"{path} states a size of {width} x {height}, more than 32768 x 16384 pixels or {MAX_SIDE} a side"
+        )
+    if spec.tile_width and max(spec.tile_width, spec.tile_height) > MAX_SIDE:
+        raise InputError(
+            f"{path} states tiles of {spec.tile_width} x {spec.tile_height}, "
+            f"at most {MAX_SIDE} a side are read"
+        )
+    if form in ("tiff", "png", "jpeg") and spec.image_bytes(True) > _MAX_RATIO * size:
+        raise InputError(
+            f"{path} states a size of {width} x {height}, but its {size} bytes cannot hold that many pixels"
+        )
+    left, top = spec.full_x - spec.x, spec.full_y - spec.y
+    if (
+        spec.full_width < 1
+        or spec.full_height < 1
+        or left < 0
+        or top < 0
+        or left + spec.full_width > width
+        or top + spec.full_height > height
+    ):
+        raise InputError(
+            f"{path} has a data window of {width} x {height} at ({spec.x}, {spec.y}) that does not cover its "
+            f"display window of {spec.full_width} x {spec.full_height} at ({spec.full_x}, {spec.full_y})"
+        )
+
+
+def _pick_channels(names: list[str], path: Path, form: str, notices: list[str]) -> list[int]:
+    """The channels to read: R, G, B and A by name, else Y, else the file's own 1, 3 or 4."""
+    found: dict[str, int] = {}
+    for index, name in enumerate(names):
+        found.setdefault(name.upper(), index)
+    if len(names) == 1:
+        picks = [0]
+    elif len(names) == 2:
+        raise InputError(f"{path} has 2 channels ({', '.join(names)}), 1, 3 or 4 were expected")
+    elif all(name in found for name in "RGB"):
+        picks = [found[name] for name in "RGBA" if name in found]
+    elif "RY" in found or "BY" in found:
+        raise InputError(
+            f"{path} stores luminance and chroma ({', '.join(names)}), channels R, G and B were expected"
+        )
+    elif "Y" in found:
+        picks = [found["Y"]]
+    elif form != "openexr" and len(names) in (3, 4):
+        picks = list(range(len(names)))
+    else:
+        shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+        raise InputError(f"{path} has {len(names)} channels ({shown}), but none named R, G and B, or Y")
+    left_out = [name for index, name in enumerate(names) if index not in picks]
+    if left_out:
+        shown = ", ".join(left_out[:8]) + (", ..." if len(left_out) > 8 else "")
+        notices.append(f"{path}: channels left out: {shown}")
+    return picks
+
+
+def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: str) -> npt.NDArray[np.float32]:
+    """The display window, (height, width, len(picks)). Read in bands of rows: a page of `out` is committed
+    only once its rows were there, so that a header that lies costs nothing."""
+    first, last = min(picks), max(picks) + 1
+    columns = slice(spec.full_x - spec.x, spec.full_x - spec.x + spec.full_width)
+    begin, end = spec.full_y, spec.full_y + spec.full_height
+    out = np.empty((end - begin, spec.full_width, len(picks)), np.float32)
+    kind = pixel if pixel in ("uint8", "uint16") else "float"
+    tile = spec.tile_height if spec.tile_width else 0
+    # Whole compressed blocks: 256 rows is the largest of EXR's (DWAB); tiles have their own.
+    unit = tile or max(1, min(int(spec.get_int_attribute("oiio:RowsPerChunk", 1)), 256))
+    rows = unit * max(1, _CHUNK_BYTES // (spec.width * (last - first) * 4 * unit))
+    order = [pick - first for pick in picks]
+    straight = order == list(range(last - first))
+    # Bands start at whole blocks of the data window, which may begin above the display window.
+    for y in range(spec.y + (begin - spec.y) // unit * unit, end, rows):
+        stop = min(y + rows, spec.y + spec.height)
+        if tile:
+            band = source.read_tiles(
+                0, 0, spec.x, spec.x + spec.width, y, stop, spec.z, spec.z + 1, first, last, kind
+            )
+        else:
+            band = source.read_scanlines(0, 0, y, stop, spec.z, first, last, kind)
+        if band is None or source.has_error:
+            raise InputError(f"{path} is truncated or corrupted: {_reason(_complaint(source), path)}")
+        band = np.asarray(band).reshape(stop - y, spec.width, last - first)
+        band = band[max(begin - y, 0) : min(stop, end) - y, columns]
+        if not straight:
+            band = band[..., order]
+        part = out[max(y, begin) - begin : min(stop, end) - begin]
+        if kind == "float":
+            part[...] = band
+        else:
+            decode_srgb(band, part)
+    return out
+
+
+def _primaries(spec: Any, form: str, head: bytes) -> tuple[float, ...] | None:
+    """CIE xy of red, green, blue and white where the file states them."""
+    if form == "openexr":
+        stated = spec.getattribute("chromaticities")
+        if stated is not None and len(stated) == 8:
+            return tuple(float(value) for value in stated)
+    if form == "hdr":  # OpenImageIO does not look at this line
+        for line in head.split(b"\n\n")[0].split(b"\n"):
+            if line.startswith(b"PRIMARIES="):
+                try:
+                    values = tuple(float(word) for word in line[10:].split())
+                except ValueError:
+                    return None
+                return values if len(values) == 8 else None
+    return None
+
+
+def _rgb_to_xyz(primaries: tuple[float, ...]) -> npt.NDArray[np.float64]:
+    xy = np.array(primaries, np.float64).reshape(4, 2)
+    xyz = np.stack([xy[:, 0], xy[:, 1], 1 - xy.sum(1)]) / xy[:, 1]
+    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
+
+
+def _to_rec709(
+    pixels: npt.NDArray[np.float32], primaries: tuple[float, ...], path: Path, notices: list[str]
+) -> None:
+    """Convert (h, w, 3 | 4) in place: M = Rec.709^-1 . Bradford^-1 . diag(white ratio) . Bradford .
+    source."""
+    # 1e-3 is a few units of the last digit that files state (.3127 against .31271).
+    if np.allclose(primaries, _REC709, rtol=0, atol=1e-3):
+        return
+    shown = " ".join(f"{value:g}" for value in primaries)
+    with np.errstate(all="ignore"):
+        try:
+            source, target = _rgb_to_xyz(primaries), _rgb_to_xyz(_REC709)
+            adapt = np.diag((_BRADFORD @ target.sum(1)) / (_BRADFORD @ source.sum(1)))
+            matrix = np.linalg.inv(target) @ np.linalg.inv(_BRADFORD) @ adapt @ _BRADFORD @ source
+        except np.linalg.LinAlgError:
+            matrix = np.full((3, 3), np.nan)
+        # Real spaces stay below 4; thousands come from primaries on one line.
+        if not np.all(np.abs(matrix) < 1e3):
+            raise InputError(f"{path} states primaries ({shown}) that span no colour space")
+        rows = max(1, _CHUNK_BYTES // (pixels.shape[1] * 24))
+        for y in range(0, len(pixels), rows):
+            pixels[y : y + rows, :, :3] = pixels[y : y + rows, :, :3] @ matrix.T
+    notices.append(f"{path}: converted to linear Rec.709 from the primaries it states ({shown})")
+
+
+def _upright(pixels: npt.NDArray[np.float32], orientation: int) -> npt.NDArray[np.float32]:
+    """Turn by the Exif orientation 1..8, which OpenImageIO reports and leaves alone."""
+    if orientation in (5, 7):
+        pixels = pixels.swapaxes(0, 1)
+    pixels = {
+        2: pixels[:, ::-1],
+        3: pixels[::-1, ::-1],
+        4: pixels[::-1],
+        6: np.rot90(pixels, -1),
+        7: pixels[::-1, ::-1],
+        8: np.rot90(pixels),
+    }.get(orientation, pixels)
+    return np.ascontiguousarray(pixels)
+
+
+def _complaint(teller: Any) -> str:
+    """Take what OpenImageIO, or one of its objects, last complained of."""
+    try:
+        return str(teller.geterror())
+    except UnicodeError:  # it quotes bytes of the file
+        return ""
+
+
+def _reason(complaint: str, path: Path) -> str:
+    """The first line of what a library said, fit to end a sentence."""
+    lines = complaint.strip().splitlines() or ["it could not be decoded"]
+    text = " ".join("".join(c if c.isprintable() else " " for c in lines[0]).split())
+    text = text.replace(f"({path})", "").replace(f'"{path}": ', "").replace(str(path), "it")
+    text = re.sub(r"^EXR Error *: *EXR_ERR_[A-Z_]+ |^(JPEG|PNG read|IFF) error:? ", "", text)
+    return " ".join(text.split())[:160].rstrip(" .:") or "it could not be decoded"

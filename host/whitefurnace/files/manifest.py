@@ -1,0 +1,39 @@
+"""Reads and writes the manifest: the JSON file, written last, that proves the rest of an output whole."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from whitefurnace.errors import FileError
+from whitefurnace.files.atomic import write_atomic
+
+# A manifest lists a few files; what is larger than this is somebody else's.
+_MAX_BYTES = 64 << 20
+
+
+def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """The manifest at `path`, or None where there is none or the file is not one of ours (a JSON object with
+    the key `whitefurnace`). Raises `FileError` for a file that is there and cannot be read."""
+    path = Path(path)
+    try:
+        if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+            return None
+        found = json.loads(path.read_bytes())
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+    except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
+        return None
+    return found if isinstance(found, dict) and "whitefurnace" in found else None
+
+
+def write_manifest(path: str | os.PathLike[str], manifest: Mapping[str, Any]) -> None:
+    """Write `manifest` as indented JSON with sorted keys. It must have the key `whitefurnace` (the version)
+    and hold finite numbers only. Raises `FileError` for what cannot be written."""
+    if "whitefurnace" not in manifest:
+        raise ValueError("a manifest must have the key 'whitefurnace', the version that wrote it")
+    text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
+    write_atomic(path, lambda temporary: temporary.write_bytes(text.encode()))

@@ -1,0 +1,1 @@
+"""The OpenCL sources, as package data; `whitefurnace.source` composes programs from them."""

@@ -1,0 +1,113 @@
+"""Imports point one way and each outside library has one door: what keeps the rooms of the house apart."""
+from __future__ import annotations
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+HOST = Path(__file__).resolve().parents[1] / "host" / "whitefurnace"
+
+# What each room may import, lowest first. A subpackage is one room; "__init__" is the public API.
+ALLOWED: dict[str, set[str]] = {
+    "errors": set(),
+    "catalogue": {"errors"},
+    "recipe": {"errors", "catalogue"},
+    "source": {"errors", "catalogue", "recipe"},
+    "device": {"errors"},
+    "plan": {"errors", "catalogue", "recipe", "source", "device"},
+    "files": {"errors"},
+    "environment": {"errors", "files"},
+    "run": {"errors", "catalogue", "recipe", "source", "device", "plan", "environment"},
+    "product": {"errors", "catalogue", "recipe", "source", "device", "plan", "environment", "run"},
+    "engines": {"errors", "catalogue", "recipe", "files"},
+    "bake": {"errors", "catalogue", "recipe", "source", "device", "plan", "files", "environment", "run",
+             "product", "engines"},
+    "__init__": {"errors", "catalogue", "recipe", "device", "plan", "environment", "run", "product",
+                 "engines", "bake"},
+    "report": {"errors", "catalogue", "recipe", "device", "plan", "run", "product", "engines", "bake",
+               "__init__"},
+    "cli": {"errors", "catalogue", "recipe", "source", "device", "plan", "files", "environment", "run",
+            "product", "engines", "bake", "__init__", "report"},
+    "__main__": {"cli"},
+}
+
+# The doors of each outside library; None: any room.
+DOORS: dict[str, set[str] | None] = {
+    "numpy": None,
+    "pyopencl": {"device"},
+    "OpenImageIO": {"files"},
+    "zstandard": {"files"},
+    "click": {"cli", "report"},
+    "rich": {"cli", "report"},
+    "scipy": {"catalogue"},
+    "msgspec": {"recipe", "files", "engines"},
+}
+
+
+def room(path: Path) -> str:
+    return path.relative_to(HOST).parts[0].removesuffix(".py")
+
+
+def imports(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and full dotted name of all that a module imports, inside functions and TYPE_CHECKING too."""
+    package = ["whitefurnace", *path.relative_to(HOST).parent.parts]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            stem = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((node.lineno, f"{stem}.{alias.name}") for alias in node.names)
+
+
+def imported_room(name: str) -> str:
+    """The room that a dotted name under `whitefurnace` is in; names of the package itself are the API's."""
+    part = name.split(".")[1] if "." in name else "__init__"
+    return part if (HOST / part).is_dir() or (HOST / f"{part}.py").is_file() else "__init__"
+
+
+def modules() -> list[Path]:
+    return sorted(path for path in HOST.rglob("*.py") if "__pycache__" not in path.parts)
+
+
+def test_the_table_points_one_way():
+    seen: set[str] = set()
+    for name, allowed in ALLOWED.items():
+        assert allowed <= seen, f"{name} may import {sorted(allowed - seen)}, which stand above it"
+        seen.add(name)
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda path: path.relative_to(HOST).as_posix())
+def test_a_module_imports_only_what_its_room_may(path):
+    here = room(path)
+    assert here in ALLOWED, f"{here} is not in tests/test_imports.py: add what it may import to ALLOWED"
+    wrong = []
+    for line, name in imports(path):
+        top = name.split(".")[0]
+        if top == "whitefurnace":
+            there = imported_room(name)
+            if name != "whitefurnace.__version__" and there != here and there not in ALLOWED[here]:
+                wrong.append(f"{path.name}:{line} imports {there}; {here} may import {sorted(ALLOWED[here])}")
+        elif top not in sys.stdlib_module_names:
+            if top not in DOORS:
+                wrong.append(f"{path.name}:{line} imports {top}, which has no door: add it to DOORS")
+            elif (doors := DOORS[top]) is not None and here not in doors:
+                wrong.append(f"{path.name}:{line} imports {top}, whose doors are {sorted(doors)}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_check_sees_every_form_of_import(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.HOST", tmp_path)
+    module = tmp_path / "files" / "one.py"
+    module.parent.mkdir()
+    module.write_text("import scipy.special\nfrom ..device import x\nfrom . import two\nfrom .. import run\n"
+                      "def f():\n    from whitefurnace import cli\n    import whitefurnace.plan as p\n")
+    (tmp_path / "run.py").touch()
+    names = {name for _, name in imports(module)}
+    assert names == {"scipy.special", "whitefurnace.device.x", "whitefurnace.files.two", "whitefurnace.run",
+                     "whitefurnace.cli", "whitefurnace.plan"}
+    assert imported_room("whitefurnace.run") == "run" and imported_room("whitefurnace.files.two") == "files"
+    assert imported_room("whitefurnace.integrate") == imported_room("whitefurnace") == "__init__"
