@@ -1,7 +1,7 @@
 """Everything that is read from or written to a file. The only importer of OpenImageIO, which is loaded when
 first needed: it takes longer to load than `--help` may."""
 
-from whitefurnace.files.atomic import digest_file, write_atomic
+from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
 from whitefurnace.files.exr import write_exr
 from whitefurnace.files.image import Image, decode_srgb, read_image
 from whitefurnace.files.manifest import read_manifest, write_manifest
@@ -9,6 +9,7 @@ from whitefurnace.files.npz import write_npz
 
 __all__ = [
     "Image",
+    "Transaction",
     "decode_srgb",
     "digest_file",
     "read_image",

@@ -7,30 +7,71 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
 
 from whitefurnace.errors import FileError
 
 
-def write_atomic(path: str | os.PathLike[str], writer: Callable[[Path], object]) -> None:
-    """Let `writer` write `.NAME.tmp` beside `path`, sync it and rename it to `path`.
+class Transaction:
+    """Several files that appear together or not at all: each is staged beside its target, and `commit` renames
+    them in the order they were staged. Leaving the block without `commit`, for whatever reason, removes what
+    was staged and leaves every target as it was."""
 
-    Whatever is raised on the way, Ctrl-C too, the temporary file is removed and an existing target is left as
-    it was. Raises `FileError` where the system refuses; what else `writer` raises passes through.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
+    def __init__(self) -> None:
+        self._targets: list[Path] = []
+
+    @staticmethod
+    def staging(path: Path) -> Path:
+        """The temporary name of a target."""
+        return path.with_name(f".{path.name}.tmp")
+
+    def stage(self, path: Path, writer: Callable[[Path], object]) -> None:
+        """Let `writer` write the temporary file of `path`, and sync it. Raises `FileError`."""
+        temporary = self.staging(path)
+        self._targets.append(path)
         try:
             writer(temporary)
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
-            os.replace(temporary, path)
-        except BaseException:
+        except OSError as error:
+            raise FileError(f"cannot write {path}: {error.strerror or error}") from error
+
+    def staged(self, path: Path) -> Path:
+        """Where the staged bytes of `path` are until `commit`."""
+        return self.staging(path)
+
+    def commit(self) -> None:
+        """Rename every staged file to its target. Raises `FileError`."""
+        while self._targets:
+            path = self._targets[0]
+            try:
+                os.replace(self.staging(path), path)
+            except OSError as error:
+                raise FileError(f"cannot write {path}: {error.strerror or error}") from error
+            del self._targets[0]
+
+    def __enter__(self) -> Transaction:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
+                 trace: TracebackType | None) -> None:
+        for path in self._targets:
             with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
-    except OSError as error:
-        raise FileError(f"cannot write {path}: {error.strerror or error}") from error
+                self.staging(path).unlink()
+
+
+def write_atomic(path: str | os.PathLike[str], writer: Callable[[Path], object], into: Transaction | None = None) -> None:
+    """Let `writer` write `.NAME.tmp` beside `path`, sync it and rename it to `path`, or stage it in `into`.
+
+    Whatever is raised on the way, Ctrl-C too, the temporary file is removed and an existing target is left as
+    it was. Raises `FileError` where the system refuses; what else `writer` raises passes through.
+    """
+    if into is not None:
+        into.stage(Path(path), writer)
+        return
+    with Transaction() as transaction:
+        transaction.stage(Path(path), writer)
+        transaction.commit()
 
 
 def digest_file(path: str | os.PathLike[str]) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import FileError
-from whitefurnace.files.atomic import write_atomic
+from whitefurnace.files.atomic import Transaction, write_atomic
 
 
 def write_exr(
@@ -19,6 +19,7 @@ def write_exr(
     *,
     channel_names: Sequence[str] = ("R", "G", "B"),
     attributes: Mapping[str, str | float | int] | None = None,
+    into: Transaction | None = None,
 ) -> None:
     """Write `pixels` (height, width, channels) as 32-bit floats, ZIP compressed: half would turn values over
     65504 into inf in silence. The same input gives the same bytes, with no time in them.
@@ -48,7 +49,7 @@ def write_exr(
         if complaint is not None:
             raise FileError(f"cannot write {path}: {complaint}")
 
-    write_atomic(path, write)
+    write_atomic(path, write, into)
 
 
 def _write(

@@ -148,9 +148,6 @@ def _decode(source: Any, path: Path, size: int, digest: str, head: bytes, notice
             f"{path} has pixels of type {pixel}, 8- or 16-bit unsigned integers or floats were expected"
         )
     pixels = _read_pixels(source, spec, picks, path, pixel)
-    if source.has_error:  # JPEG says so here when it filled the missing part with grey
-        raise InputError(f"{path} is truncated or corrupted: {_reason(_complaint(source), path)}")
-
     colour_space = str(spec.get_string_attribute("oiio:ColorSpace"))
     if pixel in ("uint8", "uint16") and form != "pnm" and colour_space and "srgb" not in colour_space.lower():
         notices.append(
@@ -258,6 +255,7 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
             )
         else:
             band = source.read_scanlines(0, 0, y, stop, spec.z, first, last, kind)
+        # JPEG fills what is missing with grey and only complains.
         if band is None or source.has_error:
             raise InputError(f"{path} is truncated or corrupted: {_reason(_complaint(source), path)}")
         band = np.asarray(band).reshape(stop - y, spec.width, last - first)

@@ -1,5 +1,5 @@
-"""Checks files for damage that OpenImageIO accepts in silence: it does not look at the checksums of deflated
-TIFF, nor miss the end of a PNG or JPEG."""
+"""Checks files for damage that OpenImageIO accepts in silence: it does not compare the checksums of a
+deflated TIFF and does not miss the end of a PNG."""
 
 from __future__ import annotations
 
@@ -19,8 +19,6 @@ def check_file(path: Path, size: int, head: bytes, notices: list[str]) -> None:
     `InputError` for what is damaged beyond doubt; a header that makes no sense is left to the reader."""
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
         _check_png(path, size, notices)
-    elif head.startswith(b"\xff\xd8\xff"):
-        _check_jpeg(path)
     elif head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
         _check_tiff(path)
 
@@ -63,12 +61,6 @@ def _check_png(path: Path, size: int, notices: list[str]) -> None:
             if kind == b"IEND":
                 return
             start += 12 + length
-
-
-def _check_jpeg(path: Path) -> None:
-    data = path.read_bytes()
-    if data.rfind(b"\xff\xd9") < data.rfind(b"\xff\xda"):
-        raise InputError(f"{path} is truncated: its JPEG data ends at byte {len(data)} without an end marker")
 
 
 def _check_tiff(path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from whitefurnace.errors import FileError
-from whitefurnace.files.atomic import write_atomic
+from whitefurnace.files.atomic import Transaction, write_atomic
 
 # A manifest lists a few files; what is larger than this is somebody else's.
 _MAX_BYTES = 64 << 20
@@ -30,10 +30,11 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
     return found if isinstance(found, dict) and "whitefurnace" in found else None
 
 
-def write_manifest(path: str | os.PathLike[str], manifest: Mapping[str, Any]) -> None:
+def write_manifest(path: str | os.PathLike[str], manifest: Mapping[str, Any], *,
+                   into: Transaction | None = None) -> None:
     """Write `manifest` as indented JSON with sorted keys. It must have the key `whitefurnace` (the version)
     and hold finite numbers only. Raises `FileError` for what cannot be written."""
     if "whitefurnace" not in manifest:
         raise ValueError("a manifest must have the key 'whitefurnace', the version that wrote it")
     text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
-    write_atomic(path, lambda temporary: temporary.write_bytes(text.encode()))
+    write_atomic(path, lambda temporary: temporary.write_bytes(text.encode()), into)

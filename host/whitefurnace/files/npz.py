@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from whitefurnace.files.atomic import write_atomic
+from whitefurnace.files.atomic import Transaction, write_atomic
 
 
-def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, npt.ArrayLike]) -> None:
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, npt.ArrayLike], *,
+              into: Transaction | None = None) -> None:
     """Write `arrays` uncompressed and in their order; `numpy.load` gives them back. Nothing is left behind
     where it fails. Raises `FileError` for what cannot be written, a full disk too."""
 
@@ -30,4 +31,4 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, npt.ArrayLike])
                 with archive.open(member, "w", force_zip64=array.nbytes > 1 << 30) as stream:
                     np.lib.format.write_array(stream, array, allow_pickle=False)
 
-    write_atomic(path, write)
+    write_atomic(path, write, into)

@@ -1,0 +1,4 @@
+"""`python -m whitefurnace`."""
+from whitefurnace.cli import main
+
+main()

@@ -1,0 +1,340 @@
+"""One environment -> the files engines load: key, skipping, ownership, writing, manifest."""
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import whitefurnace
+from whitefurnace import source
+from whitefurnace.catalogue import INTEGRALS, model
+from whitefurnace.device import Device, choose_device
+from whitefurnace.engines import Engine, engines
+from whitefurnace.environments import Environment, environment
+from whitefurnace.errors import FileError, UsageError
+from whitefurnace.files import Transaction, digest_file, read_manifest, write_exr, write_manifest, write_npz
+from whitefurnace.lighting import Lighting, light
+from whitefurnace.plan import LevelPlan, plan_chain
+from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain
+from whitefurnace.run import Integrated, dfg
+
+DEMO = "demo"
+DEMO_HEIGHT = 512
+SUN_RADIUS = math.radians(0.2665)  # of the sun as seen from the earth
+SUN_RADIANCE = 4e5
+DFG_TOLERANCE = 5e-6
+
+
+def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
+    """The built-in environment: sky, ground, and a sun over 1e5 times the mean radiance, by a kernel."""
+    program = device.build(source.demo().text, {"W": 1, "T": 1, "PRECISION": 32})
+    # At the centre of a texel, so that the disc covers one whole and the maximum is the sun's own radiance.
+    theta = (round(0.29 * height) + 0.5) * math.pi / height
+    phi = (round(1.27 * height) + 0.5) * math.pi / height - math.pi
+    size = device.local_size
+    image = device.empty((height, 2 * height, 3), np.float32)
+    count = -(-2 * height * height // size) * size
+    sun = [math.sin(theta) * math.cos(phi), math.cos(theta), math.sin(theta) * math.sin(phi)]
+    device.launch(program.kernel("demo"), (count,),
+                  (image, np.int32(height), np.int32(8), *(np.float32(x) for x in sun),
+                   np.float32(math.cos(SUN_RADIUS)), np.float32(SUN_RADIANCE)))
+    return replace(environment(image.read()), name=DEMO)
+
+
+@dataclass(frozen=True)
+class Target:
+    """One file of a bake: its path, and what writes it there."""
+
+    path: Path
+    engine: str
+    nbytes: int
+    """Bytes of its arrays, before any compression."""
+    write: Callable[[Transaction], None] | None = None
+
+
+@dataclass(frozen=True)
+class Baked:
+    """What a bake did or would do for one environment: `done`, `skipped` or `planned`, and its manifest."""
+
+    name: str
+    state: str
+    files: tuple[Path, ...]
+    manifest: dict[str, Any]
+    plan: tuple[LevelPlan, ...]
+    nbytes: tuple[int, ...]
+    notices: tuple[str, ...]
+    levels: tuple[dict[str, Any], ...] = ()
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Order:
+    """A validated bake of several environments."""
+
+    names: tuple[str, ...]
+    sources: tuple[Any, ...]
+    output: Path
+    engines: tuple[Engine, ...]
+    recipe: Chain
+    rotate: float
+    exposure: float
+    nonfinite: str
+    force: bool
+
+
+def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str = "raw", rotate: float = 0.0,
+          exposure: float = 0.0, nonfinite: str = "refuse", force: bool = False, **options: Any) -> Order:
+    """A validated order; `options` are those of `recipe.chain`. Raises UsageError, UnsupportedError."""
+    if not sources:
+        raise UsageError("no environment was given")
+    names = []
+    for item in sources:
+        if isinstance(item, Environment):
+            names.append(item.name)
+        elif isinstance(item, (str, os.PathLike)):
+            names.append(Path(os.path.abspath(item)).stem if not _is_demo(item) else DEMO)
+        else:
+            raise UsageError("bake takes paths; make an environment of an array first and give it a name")
+    for k, name in enumerate(names):
+        if name in names[:k]:
+            raise UsageError(f"two inputs are named {name!r}: their outputs would be the same files")
+        if name in ("", ".", "..") or "/" in name or "\\" in name:
+            raise UsageError(f"{name!r} cannot name an output")
+    return Order(tuple(names), tuple(sources), Path(output), engines(for_), chain(**options), float(rotate),
+                 float(exposure), nonfinite, force)
+
+
+def _is_demo(item: Any) -> bool:
+    """The word `demo` is the built-in environment, unless there is such a path: a path always wins."""
+    return str(item) == DEMO and not os.path.exists(item)
+
+
+def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str | None = None,
+         dry_run: bool = False, progress: Callable[[str, str, float], None] | None = None,
+         **options: Any) -> list[Baked]:
+    """Bakes environments (a path or a list; `demo` is built in) into `output`.
+
+    options: for_ ("raw,exr"), size, min_size, ndf, tolerance or quality, rotate (degrees), exposure (stops),
+    nonfinite ("refuse", "zero"), force. Files go to `output/ENGINE/STEM…`; `output/STEM.json`, written last,
+    proves the rest whole. An environment whose manifest has the same key is skipped. Raises UsageError,
+    FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an environment
+    that fails.
+    """
+    single = isinstance(sources, (str, os.PathLike, Environment))
+    request = order([sources] if single else list(sources), output, **options)
+    return [bake_one(request, k, device, dry_run=dry_run, progress=progress) for k in range(len(request.names))]
+
+
+def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_run: bool = False,
+             progress: Callable[[str, str, float], None] | None = None) -> Baked:
+    """The k-th environment of an order."""
+    begin = time.perf_counter()
+    name, item = request.names[k], request.sources[k]
+    on: Device | None = device if isinstance(device, Device) else None
+    if _is_demo(item):
+        on = on or choose_device(device if isinstance(device, str) else None)
+        item = demo(on)
+    # With its rotation and exposure applied: the kernels see the environment only through these.
+    env = environment(item, rotate=request.rotate, exposure=request.exposure,
+                      nonfinite=request.nonfinite)  # type: ignore[arg-type]
+    recipe = _canonical(request)
+    key = _key(env, recipe)
+    targets = _targets(request, name)
+    texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
+    planned = plan_chain(request.recipe, texel)
+    files = tuple(t.path for t in targets)
+    sizes = tuple(t.nbytes for t in targets)
+    path = request.output / f"{name}.json"
+    known = _manifests(path, name)
+    if not request.force and known and known[0].get("key") == key and _whole(known[0], request.output):
+        return Baked(name, "skipped", files, known[0], planned, sizes, env.notices,
+                     tuple(known[0].get("levels", ())), time.perf_counter() - begin)
+    _check_ownership([*files, path], known, request, path)
+    if dry_run:
+        return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, env.notices)
+    _check_writable(request.output)
+    on = on or choose_device(device if isinstance(device, str) else None)
+    tell = (lambda what, share: progress(name, what, share)) if progress else None
+    lit = light(on, env, request.recipe, latlong=any(e.latlong for e in request.engines), seed=key, progress=tell)
+    table = dfg(DFG_SIZE, ndf=request.recipe.ndf.model, tolerance=DFG_TOLERANCE, device=on)
+    manifest = _manifest(env, recipe, key, on, lit, table)
+    with Transaction() as transaction:
+        digests = {}
+        provenance = {"whitefurnace": whitefurnace.__version__, "key": key, "source": env.digest,
+                      "recipe": json.dumps(recipe, sort_keys=True)}
+        for target in _targets(request, name, lit, table, provenance):
+            assert target.write is not None
+            target.path.parent.mkdir(parents=True, exist_ok=True)
+            target.write(transaction)
+            digests[target.path.relative_to(request.output).as_posix()] = {
+                "sha256": digest_file(transaction.staged(target.path)),
+                "bytes": transaction.staged(target.path).stat().st_size}
+        manifest["files"] = digests
+        write_manifest(path, manifest, into=transaction)
+        transaction.commit()
+    seconds = [level.seconds for level in lit.levels]
+    rows = tuple({**row, "seconds": s} for row, s in zip(manifest["levels"], seconds, strict=True))
+    return Baked(name, "done", files, manifest, planned, sizes, env.notices, rows, time.perf_counter() - begin)
+
+
+def _canonical(request: Order) -> dict[str, Any]:
+    """The recipe as data: everything that changes the bytes, and nothing else."""
+    return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines), "rotate": request.rotate,
+            "exposure": request.exposure, "nonfinite": request.nonfinite, "irradiance": IRRADIANCE_SIZE,
+            "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE}}
+
+
+def _key(env: Environment, recipe: dict[str, Any]) -> str:
+    """sha256 over the source bytes, the canonical recipe, the kernels and the version."""
+    ndf = model("ndf", recipe["ndf"]["name"])
+    slots = {"ndf": ndf, "masking": model("masking", "smith")}
+    texts = [source.texels(env.kind), source.overlap(), source.convolution(ndf), source.convolution(None),
+             source.integration(INTEGRALS["dfg"], slots)]
+    parts = [whitefurnace.__version__, env.digest, json.dumps(recipe, sort_keys=True), *(t.digest for t in texts)]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _manifests(path: Path, name: str) -> list[dict[str, Any]]:
+    """Our manifest of this item, and one that a killed run left staged: both prove what is ours."""
+    found = [read_manifest(p) for p in (path, Transaction.staging(path))]
+    return [m for m in found if m is not None and m.get("name") == name]
+
+
+def _whole(manifest: dict[str, Any], output: Path) -> bool:
+    files = manifest.get("files")
+    if not isinstance(files, dict) or not files:
+        return False
+    for relative, entry in files.items():
+        path = output / relative
+        if not path.is_file() or digest_file(path) != entry.get("sha256"):
+            return False
+    return True
+
+
+def _check_ownership(paths: Sequence[Path], known: Sequence[dict[str, Any]], request: Order, manifest: Path) -> None:
+    """Refuses to replace what no manifest of ours proves to be ours for this item. Raises FileError."""
+    if request.force:
+        return
+    ours = {relative: entry.get("sha256") for m in reversed(known) for relative, entry in m.get("files", {}).items()}
+    candidates: dict[str, set[str]] = {}
+    for m in known:
+        for relative, entry in m.get("files", {}).items():
+            candidates.setdefault(relative, set()).add(entry.get("sha256"))
+    for path in paths:
+        if not path.exists():
+            continue
+        if path == manifest and known:
+            continue
+        relative = path.relative_to(request.output).as_posix()
+        if relative not in ours or not path.is_file() or digest_file(path) not in candidates[relative]:
+            raise FileError(f"{path} is there and was not written by this bake; move it away or give --force")
+
+
+def _check_writable(output: Path) -> None:
+    """Finds an output folder that cannot be made or written before the work is done, not after."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        probe = output / f".whitefurnace-{os.getpid()}.tmp"
+        with open(probe, "wb"):
+            pass
+        probe.unlink()
+    except OSError as error:
+        raise FileError(f"cannot write into {output}: {error.strerror or error}") from error
+
+
+def _manifest(env: Environment, recipe: dict[str, Any], key: str, device: Device, lit: Lighting,
+              table: Integrated) -> dict[str, Any]:
+    def row(level: Any, kept: float | None = None) -> dict[str, Any]:
+        data = {"size": level.texels.shape[-2], "roughness": level.roughness, "method": level.method,
+                "pairs": level.pairs, "error": level.error, "worst": level.worst, "rmse": level.rmse}
+        return data if kept is None else {**data, "energy_kept": 1 + kept}
+
+    return {
+        "whitefurnace": whitefurnace.__version__,
+        "name": env.name,
+        "key": key,
+        "recipe": recipe,
+        "device": device.identity(),
+        "source": {"sha256": env.digest, "layout": env.layout, "statistics": env.statistics,
+                   "notices": list(env.notices)},
+        "levels": [row(level, kept) for level, kept in zip(lit.levels, lit.energy_kept, strict=True)],
+        "latlong_levels": [row(level) for level in lit.latlongs],
+        "irradiance": row(lit.irradiance),
+        "sh": {"coefficients": lit.sh.tolist(), "error": lit.sh_error},
+        "dfg": {"size": DFG_SIZE, "error": table.error, "rule": table.rule},
+    }
+
+
+# ------------------------------------------------------------------------------------------------- containers
+
+
+def _targets(request: Order, name: str, lit: Lighting | None = None, table: Integrated | None = None,
+             provenance: dict[str, str] | None = None) -> list[Target]:
+    """The files of every engine; with the results at hand, also what writes them."""
+    found: list[Target] = []
+    for engine in request.engines:
+        found += CONTAINERS[engine.container](request, engine, name, lit, table, provenance or {})
+    return found
+
+
+def _npz(request: Order, engine: Engine, name: str, lit: Lighting | None, table: Integrated | None,
+         provenance: dict[str, str]) -> list[Target]:
+    path = request.output / engine.name / f"{name}.npz"
+    count = 3 * sum(6 * s * s for s, _ in request.recipe.levels) + 3 * 6 * IRRADIANCE_SIZE**2 + 2 * DFG_SIZE**2
+    if lit is None or table is None:
+        return [Target(path, engine.name, 4 * count)]
+    arrays: dict[str, np.ndarray] = {f"specular_{k}": level.texels for k, level in enumerate(lit.levels)}
+    for statistic in ("roughness", "error", "worst", "rmse"):
+        arrays[statistic] = np.array([getattr(level, statistic) for level in lit.levels])
+    arrays |= {"irradiance": lit.irradiance.texels, "sh": lit.sh, "dfg": table.values}
+    arrays |= {f"coverage_{k}": a for k, a in enumerate(lit.coverage)}
+    return [Target(path, engine.name, 4 * count, lambda t: write_npz(path, arrays, into=t))]
+
+
+def _exr(request: Order, engine: Engine, name: str, lit: Lighting | None, table: Integrated | None,
+         provenance: dict[str, str]) -> list[Target]:
+    targets: list[Target] = []
+
+    def add(ending: str, shape: tuple[int, int], texels: np.ndarray | None, alpha: np.ndarray | None = None,
+            channels: str = "RGB", **attributes: Any) -> None:
+        path = request.output / engine.name / f"{name}_{ending}.exr"
+        nbytes = 4 * shape[0] * shape[1] * len(channels)
+        if texels is None:
+            targets.append(Target(path, engine.name, nbytes))
+            return
+        pixels = texels.reshape(*shape, -1)
+        names = channels
+        if alpha is not None:
+            pixels, names = np.concatenate([pixels, alpha.reshape(*shape, 1)], -1), "RGBA"
+        told = {f"whitefurnace:{key}" if key != "whitefurnace" else "whitefurnace:version": value
+                for key, value in provenance.items()}
+        told |= {f"whitefurnace:{key}": value for key, value in attributes.items()}
+        targets.append(Target(path, engine.name, nbytes, lambda t: write_exr(
+            path, pixels, channel_names=tuple(names), attributes=told, into=t)))
+
+    for k, (size, _) in enumerate(request.recipe.levels):
+        for ending, shape, levels, coverage in (
+            (f"specular_{k}", (6 * size, size), lit and lit.levels, lit and lit.coverage),
+            (f"specular_{k}_latlong", (2 * size, 4 * size), lit and lit.latlongs, lit and lit.latlong_coverage),
+        ):
+            level = levels[k] if levels else None
+            told = {} if level is None else {"roughness": level.roughness, "error": level.error,
+                                             "worst": level.worst, "rmse": level.rmse, "method": level.method}
+            add(ending, shape, None if level is None else level.texels, coverage[k] if coverage else None, **told)
+    e = lit and lit.irradiance
+    sh = {} if lit is None or e is None else {"error": e.error, "sh": json.dumps(lit.sh.tolist())}
+    add("irradiance", (6 * IRRADIANCE_SIZE, IRRADIANCE_SIZE), e.texels if e else None, **sh)
+    add("dfg", (DFG_SIZE, DFG_SIZE), None if table is None else table.values, channels="RG",
+        **({} if table is None else {"error": table.error, "rule": table.rule}))
+    return targets
+
+
+CONTAINERS = {"npz": _npz, "exr": _exr}

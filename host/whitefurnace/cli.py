@@ -1,0 +1,192 @@
+"""The command line: argv -> recipe -> … -> exit code. The only module that prints."""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from whitefurnace.errors import WhitefurnaceError
+
+# Heavy modules (numpy, OpenCL, image libraries) are imported by the commands that need them: --help is quick.
+
+EPILOG_BAKE = """\b
+Examples:
+  whitefurnace bake studio.hdr -o baked
+  whitefurnace bake day.exr night.exr -o baked --for raw,exr --size 512 --min-size 8
+  whitefurnace bake studio.hdr -o baked --quality reference --rotate 90 --exposure -1
+  whitefurnace bake demo -o baked --dry-run
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported,
+7 a tolerance was missed, 8 part of several failed, 130 interrupted.
+"""
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="whitefurnace")
+def cli() -> None:
+    """Bakes image-based lighting and integrates BRDFs on OpenCL devices, and states the error of what it writes."""
+
+
+@cli.command(epilog=EPILOG_BAKE)
+@click.argument("environments", metavar="ENV...", nargs=-1, required=True)
+@click.option("-o", "--output", metavar="DIR", required=True, type=click.Path(path_type=Path), help="Output folder.")
+@click.option("--for", "for_", metavar="LIST", default="raw", show_default=True,
+              help="Who loads it, separated by commas: raw (.npz), exr (strips and lat-longs).")
+@click.option("--size", type=int, default=256, show_default=True, help="Face edge of the first level, a power of two.")
+@click.option("--min-size", type=int, default=16, show_default=True, help="Face edge of the last level.")
+@click.option("--ndf", metavar="NAME[:p=v,...]", default="ggx", show_default=True,
+              help="The lobe; `whitefurnace models` lists them.")
+@click.option("--tolerance", metavar="X", type=float, help="Bound on the stated error of every level. [default: 1e-3]")
+@click.option("--quality", metavar="NAME", help="draft (1e-2), normal (1e-3) or reference (2e-5), for --tolerance.")
+@click.option("--rotate", metavar="DEG", type=float, default=0.0, help="Turn the environment about +Y, +X towards +Z.")
+@click.option("--exposure", metavar="EV", type=float, default=0.0, help="Multiply radiance by 2^EV.")
+@click.option("--nonfinite", metavar="refuse|zero", default="refuse", show_default=True,
+              help="What to do with NaN, infinite and negative values.")
+@click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done and written, and do nothing.")
+@click.option("--force", is_flag=True, help="Bake again, and replace files that are not known to be ours.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
+@click.option("--quiet", is_flag=True, help="Print errors only.")
+def bake(environments: tuple[str, ...], output: Path, for_: str, device: str | None, dry_run: bool, as_json: bool,
+         quiet: bool, **options: Any) -> None:
+    """Bake environments into what engines load: the specular chain, irradiance, spherical harmonics and the DFG
+    table, each with its error.
+
+    ENV is an image (EXR, HDR, PNG, TIFF, ...) as lat-long, cross or strip, a folder of six faces (px, nx, py, ny,
+    pz, nz), or the word demo for the built-in sky.
+    """
+    from whitefurnace import baking, report
+
+    order = baking.order(environments, output, for_=for_, **options)
+    failures: list[tuple[str, WhitefurnaceError]] = []
+    with _progress(not (quiet or as_json)) as tell:
+        for k, name in enumerate(order.names):
+            try:
+                baked = baking.bake_one(order, k, device, dry_run=dry_run, progress=tell)
+            except WhitefurnaceError as error:
+                failures.append((name, error))
+                if len(order.names) > 1:
+                    if as_json:
+                        _json({"event": "error", "name": name, "message": str(error), "exit_code": error.exit_code})
+                    _say(f"error: {name}: {error}")
+                continue
+            for notice in baked.notices:
+                if not quiet:
+                    _say(f"notice: {name}: {notice}")
+            if as_json:
+                for row in report.baked_rows(baked):
+                    _json(row)
+            elif not quiet:
+                click.echo(report.baked_text(baked, output))
+    if len(order.names) == 1 and failures:
+        raise failures[0][1]
+    if failures:
+        codes = {error.exit_code for _, error in failures}
+        _say(f"error: {len(failures)} of {len(order.names)} environments failed")
+        sys.exit(codes.pop() if len(failures) == len(order.names) and len(codes) == 1 else 8)
+
+
+@cli.command(epilog="\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 one works, 4 none does.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout.")
+def devices(as_json: bool) -> None:
+    """List OpenCL devices with a verdict: a device counts only after a small build and run gave the right answer."""
+    from dataclasses import asdict
+
+    from whitefurnace import report
+    from whitefurnace.device import INSTALL, find_devices
+    from whitefurnace.errors import DeviceError
+
+    found = find_devices()
+    for candidate in found if as_json else ():
+        _json(asdict(candidate))
+    if found and not as_json:
+        click.echo(report.devices_text(found))
+    if not any(candidate.works for candidate in found):
+        raise DeviceError(f"no OpenCL device {'works' if found else 'was found'}: {INSTALL}")
+
+
+@cli.command(epilog="\b\nExamples:\n  whitefurnace models\n  whitefurnace models ggx --json")
+@click.argument("name", required=False)
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout.")
+def models(name: str | None, as_json: bool) -> None:
+    """List the models of the catalogue, or one, with parameters, domains and sources."""
+    from whitefurnace import report
+    from whitefurnace.catalogue import SLOTS
+    from whitefurnace.catalogue import models as of_slot
+    from whitefurnace.errors import UsageError, nearest
+
+    entries = [entry for slot in SLOTS for entry in of_slot(slot).values()]
+    if name is not None:
+        wanted = [entry for entry in entries if entry.name == name]
+        if not wanted:
+            raise UsageError(f"unknown model {name!r}{nearest(name, [entry.name for entry in entries])}")
+        entries = wanted
+    if as_json:
+        for row in report.model_rows(entries):
+            _json(row)
+    else:
+        click.echo(report.models_text(entries))
+
+
+def _json(row: dict[str, Any]) -> None:
+    click.echo(json.dumps(row, ensure_ascii=False, allow_nan=False, default=str))
+
+
+def _say(text: str) -> None:
+    click.echo(text, err=True)
+
+
+@contextlib.contextmanager
+def _progress(wanted: bool) -> Iterator[Callable[[str, str, float], None] | None]:
+    """A bar on stderr, where that is a terminal."""
+    if not wanted or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def tell(name: str, what: str, share: float) -> None:
+            if name not in tasks:
+                tasks[name] = bar.add_task(name, total=1.0)
+            bar.update(tasks[name], completed=share, description=f"{name}  {what}")
+
+        yield tell
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Entry point: runs the command and turns every error into one sentence and its exit code."""
+    try:
+        result = cli.main(argv, prog_name="whitefurnace", standalone_mode=False)
+        sys.stdout.flush()
+        code = result if isinstance(result, int) else 0
+    except WhitefurnaceError as error:
+        if "--json" in (sys.argv[1:] if argv is None else argv):
+            _json({"event": "error", "message": str(error), "exit_code": error.exit_code})
+        _say(f"error: {error}")
+        code = error.exit_code
+    except click.exceptions.Exit as done:
+        code = done.exit_code
+    except click.ClickException as error:
+        _say(f"error: {error.format_message()}")
+        code = 1
+    except (click.Abort, KeyboardInterrupt):
+        _say("interrupted: nothing half-written was left")
+        code = 130
+    except BrokenPipeError:  # the reader of stdout went away; what it did not read cannot be flushed either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        code = 2
+    except MemoryError:
+        _say("error: there is not enough memory for this; a smaller input or size is needed")
+        code = 2
+    sys.exit(code)

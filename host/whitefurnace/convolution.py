@@ -1,0 +1,556 @@
+"""Plan -> levels: runs the prefilter of one environment on a device, certifies every level against the exact
+integral, and refines what misses its tolerance."""
+from __future__ import annotations
+
+import hashlib
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from whitefurnace import plan as planning
+from whitefurnace import source
+from whitefurnace.catalogue import Model
+from whitefurnace.catalogue.rule import gauss
+from whitefurnace.device import Buffer, Device, Kernel
+from whitefurnace.environments import Environment, cube_solid_angles, latlong_solid_angles
+
+from whitefurnace.recipe import Chosen
+
+Progress = Callable[[str, float], None]
+"""Called with what is being done and its share of the whole, 0 to 1."""
+
+# What float32 leaves in a certified error however close the two sums: directions and partial sums, measured
+# against float64 in tests/test_prefilter.py.
+ROUNDING = 4e-6
+
+HARMONICS_CHUNK = 1024
+
+
+@dataclass(frozen=True)
+class Level:
+    """One finished level: texels (6, size, size, 3) or lat-long (size, 2 size, 3), float32, and its statement.
+
+    `error` bounds the 99th percentile of texel errors at 95 % confidence, `worst` is the largest seen, `rmse`
+    the relative RMSE; `grid` and `method` say how it was made; `seconds` is wall time, certificate included.
+    """
+
+    texels: np.ndarray
+    roughness: float
+    error: float
+    worst: float
+    rmse: float
+    method: str
+    grid: int
+    pairs: int
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Where a level is evaluated: the texel centres of a cube or of a lat-long image."""
+
+    latlong: bool
+    size: int  # face edge, or height of the lat-long
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        return (self.size, 2 * self.size) if self.latlong else (6, self.size, self.size)
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.dims))
+
+    def directions(self) -> np.ndarray:
+        return _latlong_directions(self.size) if self.latlong else _cube_directions(self.size)
+
+    def solid_angles(self) -> np.ndarray:
+        """(count,) float64."""
+        if self.latlong:
+            return np.repeat(latlong_solid_angles(self.size, 2 * self.size), 2 * self.size)
+        return np.tile(cube_solid_angles(self.size).ravel(), 6)
+
+
+@cache
+def _cube_directions(size: int) -> np.ndarray:
+    """(3, 6 size²) unit directions of texel centres, float64, in the GL-direct layout."""
+    a = (2 * np.arange(size) + 1) / size - 1
+    t, s = np.meshgrid(a, a, indexing="ij")
+    o = np.ones_like(s)
+    faces = [(o, -t, -s), (-o, -t, s), (s, o, t), (s, -o, -t), (s, -t, o), (-s, -t, -o)]
+    d = np.array([np.stack(f) for f in faces]).transpose(1, 0, 2, 3).reshape(3, -1)
+    return d / np.sqrt((d * d).sum(0))
+
+
+@cache
+def _latlong_directions(height: int) -> np.ndarray:
+    """(3, 2 height²) unit directions of the texel centres of a lat-long image, float64."""
+    theta = (np.arange(height) + 0.5) * math.pi / height
+    phi = (np.arange(2 * height) + 0.5) * math.pi / height - math.pi
+    theta, phi = np.meshgrid(theta, phi, indexing="ij")
+    return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)]).reshape(3, -1)
+
+
+def lobe_norm(ndf: Model, parameters: dict[str, float]) -> float:
+    """∫ K dω of the prefilter's lobe, in float64 by Gauss panels in log s from the entry's reference."""
+    edges = np.concatenate([[0.0], np.geomspace(1e-14, 1.0, 57)])
+    x, w = gauss(12)
+    total = 0.0
+    for a, b in zip(edges[:-1], edges[1:], strict=True):
+        s = a + (b - a) * x
+        total += float((w * (b - a) * ndf.reference["D"](np.sqrt(1 - s / 2), **parameters) * (1 - s)).sum())
+    return 2 * math.pi * total
+
+
+class Convolver:
+    """The state of one environment on one device: texels, source grids, compiled kernels.
+
+    Radiance is scaled by a power of two to a mean near 1, which is exact and keeps sums of very bright or very
+    dark images inside float32; results are scaled back.
+    """
+
+    def __init__(self, device: Device, environment: Environment, *, seed: str = "",
+                 progress: Progress | None = None) -> None:
+        self.device = device
+        self.environment = environment
+        self.seed = seed
+        self.progress = progress or (lambda _what, _share: None)
+        e = environment
+        self.latlong = e.kind == "latlong"
+        self.rows, self.columns = e.texels.shape[-3:-1]
+        self.faces = 1 if self.latlong else 6
+        omega = (np.repeat(latlong_solid_angles(self.rows, self.columns)[:, None], self.columns, 1) if self.latlong
+                 else np.broadcast_to(cube_solid_angles(self.rows), (6, self.rows, self.columns)))
+        self._mean = np.tensordot(omega, e.texels, omega.ndim) / (4 * math.pi)
+        mean = float(self._mean.mean())
+        self.scale = 2.0 ** -round(math.log2(mean)) if mean > 0 and math.isfinite(mean) else 1.0
+        texels = device.aligned_empty(e.texels.shape, np.float32)
+        np.multiply(e.texels, np.float32(self.scale), out=texels)
+        self.texel = math.pi / self.rows if self.latlong else math.pi / 2 / self.rows
+        self._omega = omega
+        self._texels = texels
+        self._radiance = device.array(texels)
+        self._clipped, self._bright = self._extract(texels, omega)
+        self._texel_program = source.texels(e.kind)
+        self._tables: dict[int, tuple[Buffer, Buffer]] = {}
+        self._grids: dict[int, Buffer] = {}
+        self._fine: tuple[int, Buffer] | None = None
+        self._harmonics: dict[int, np.ndarray] = {}  # 9 × 3 coefficients and ∑w, by cuts
+
+    @property
+    def energy(self) -> float:
+        """∫ L dω of the source, all channels together."""
+        return 4 * math.pi * float(np.sum(self._mean))
+
+    # ------------------------------------------------------------------------------------------- sources
+
+    def _extract(self, texels: np.ndarray, omega: np.ndarray) -> tuple[Buffer, tuple[np.ndarray, np.ndarray]]:
+        """Clips the BRIGHT texels of largest radiance × solid angle to the least of them.
+
+        Gives the clipped texels and the (indices, excess radiance) taken; a sun then leaves neither a firefly
+        nor a hole, since its excess is summed exactly for each output.
+        """
+        energy = texels.sum(-1) * omega.astype(np.float32)
+        flat = energy.ravel()
+        count = min(planning.BRIGHT, flat.size)
+        index = np.argpartition(flat, flat.size - count)[flat.size - count:]
+        index = index[np.argsort(-flat[index], kind="stable")]
+        level = flat[index].min()
+        keep = np.divide(level, flat[index], out=np.ones(count, np.float32), where=flat[index] > 0)
+        clipped = texels.reshape(-1, 3).copy()
+        original = clipped[index]
+        clipped[index] = original * keep[:, None]
+        excess = original - clipped[index]
+        real = excess.any(1)
+        return self.device.array(clipped), (index[real], excess[real])
+
+    def _table(self, cuts: int) -> tuple[Buffer, Buffer]:
+        """Row and column tables of quadrature nodes, made in float64; see texels/*.clh."""
+        if cuts not in self._tables:
+            x, w = (np.array([0.5]), np.array([1.0])) if cuts == 1 else _composite(cuts)
+            tables = (_latlong_tables(self.rows, self.columns, x, w, self.environment.rotation) if self.latlong
+                      else _cube_tables(self.rows, x, w))
+            self._tables[cuts] = tuple(self.device.array(t.astype(np.float32)) for t in tables)  # type: ignore[assignment]
+        return self._tables[cuts]
+
+    def _texel_arguments(self, cuts: int, radiance: Buffer) -> tuple[Any, ...]:
+        rows, columns = self._table(cuts)
+        turn = self.environment.rotation
+        return (np.int32(self.rows), np.int32(self.columns), np.int32(cuts), np.float32(math.cos(turn)),
+                np.float32(math.sin(turn)), rows, columns, radiance)
+
+    def _texel_kernel(self, name: str) -> Kernel:
+        return self.device.build(self._texel_program.text,
+                                 {"W": 1, "T": 1, "PRECISION": 32, "ORDER": planning.ORDER}).kernel(name)
+
+    def _launch(self, kernel: Kernel, count: int, args: Sequence[Any]) -> None:
+        size = self.device.local_size
+        self.device.launch(kernel, (-(-count // size) * size,), args)
+
+    def _finest(self, n: int, alpha: float) -> tuple[int, Buffer]:
+        """The anterpolated grid made straight from the texels; coarser ones are made from it."""
+        if self._fine is None or self._fine[0] < n:
+            cuts = planning.cuts_for(self.texel, alpha, 1e-4)
+            grid = self.device.empty((6, n, n, 4), np.float32)
+            moments = self.device.empty(((n - 1) ** 2, planning.ORDER**2 * 4), np.float32)
+            for face in range(6):
+                self._launch(self._texel_kernel("anterpolate"), (n - 1) ** 2,
+                             (moments, np.int32(n), np.int32(face), *self._texel_arguments(cuts, self._clipped)))
+                self._launch(self._texel_kernel("gather"), n * n, (grid, np.int32(n), np.int32(face), moments))
+            self._fine = n, grid
+            self._grids.clear()
+        return self._fine
+
+    def prepare(self, n: int, alpha: float) -> None:
+        """Makes the finest grid that a set of levels will need, so that none is made from the texels twice."""
+        self._finest(n, alpha)
+
+    def _grid(self, n: int, alpha: float) -> Buffer:
+        """The source list of the n × n grid."""
+        if n not in self._grids:
+            fine, grid = self._finest(n, alpha)
+            if n < fine:
+                matrix, first, last = (self.device.array(a) for a in _coarsening(fine, n))
+                sizes = (np.int32(fine), np.int32(n))
+                half = self.device.empty((6, fine, n, 4), np.float32)
+                self._launch(self._texel_kernel("coarsen"), 6 * fine * n,
+                             (half, grid, matrix, first, last, *sizes, np.int32(1), np.int32(6 * fine)))
+                grid = self.device.empty((6, n, n, 4), np.float32)
+                self._launch(self._texel_kernel("coarsen"), 6 * n * n,
+                             (grid, half, matrix, first, last, *sizes, np.int32(n), np.int32(6 * n)))
+            tangent = np.tan(((2 * np.arange(n) + 1) / n - 1) * math.pi / 4).astype(np.float32)
+            listed = self.device.empty((6 * n * n, 8), np.float32)
+            self._launch(self._texel_kernel("grid_list"), 6 * n * n, (listed, np.int32(n),
+                                                                      self.device.array(tangent), grid))
+            self._grids[n] = listed
+        return self._grids[n]
+
+    def _bright_list(self, cuts: int) -> Buffer | None:
+        index, excess = self._bright
+        if not len(index):
+            return None
+        listed = self.device.empty((len(index) * cuts * cuts, 8), np.float32)
+        self._launch(self._texel_kernel("chosen_nodes"), len(index) * cuts * cuts,
+                     (listed, np.int32(len(index)), self.device.array(index.astype(np.int32)),
+                      self.device.array(excess), *self._texel_arguments(cuts, self._clipped)))
+        return listed
+
+    def _bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
+        """Every node of the unclipped source, in bands: (list, nodes in it, share done)."""
+        total = self.faces * self.rows * self.columns * cuts * cuts
+        listed = self.device.empty((min(planning.NODES_A_BAND, total), 8), np.float32)
+        for first in range(0, total, planning.NODES_A_BAND):
+            count = min(planning.NODES_A_BAND, total - first)
+            self._launch(self._texel_kernel("nodes"), count,
+                         (listed, np.int32(first), np.int32(count), *self._texel_arguments(cuts, self._radiance)))
+            yield listed, count, (first + count) / total
+
+    # ------------------------------------------------------------------------------------------- lobes
+
+    def _lobe(self, lobe: Lobe, precision: int = 32) -> tuple[Kernel, Kernel, int]:
+        lanes = self.device.lanes(precision)
+        vectors = self.device.vectors if precision == 32 else 1
+        program = self.device.build(source.convolution(lobe.model).text,
+                                    {"W": lanes, "T": vectors, "PRECISION": precision})
+        return program.kernel("convolve"), program.kernel("finish"), lanes * vectors
+
+    def _partials(self, lobe: Lobe, listed: Buffer, count: int, directions: Buffer, partial: Buffer, first: int,
+                  ) -> int:
+        """Adds ⌈count/CHUNK⌉ partial sums of a list to `partial` from split `first` on; how many they were."""
+        convolve, _, step = self._lobe(lobe)
+        outputs = directions.shape[1]
+        splits = -(-count // planning.CHUNK)
+        self.device.launch(convolve, (outputs // step, splits),
+                           (partial, np.int32(outputs), np.int32(count), np.int32(planning.CHUNK), np.int32(first),
+                            directions, listed, *lobe.scalars))
+        return splits
+
+    def convolve(self, lobe: Lobe, shape: Shape, n: int, cuts: int, share: tuple[float, float]) -> np.ndarray:
+        """The level over all directions of `shape` from the n × n grid and the bright texels, (dims, 3)."""
+        listed, bright = self._grid(n, lobe.alpha), self._bright_list(max(2, cuts))
+        _, finish, step = self._lobe(lobe)
+        step *= self.device.local_size
+        count = listed.shape[0]
+        tile = max(planning.PAIRS_A_LAUNCH // count // step, 1) * step
+        directions = shape.directions()
+        out = np.empty((shape.count, 3), np.float32)
+        for begin in range(0, shape.count, tile):
+            part = directions[:, begin:begin + tile]
+            used = part.shape[1]
+            padded = -(-used // step) * step
+            block = self.device.array(np.pad(part, ((0, 0), (0, padded - used)), mode="edge").astype(np.float32))
+            partial = self.device.empty((-(-count // planning.CHUNK), 4, padded), np.float32)
+            splits = self._partials(lobe, listed, count, block, partial, 0)
+            bright_splits, extra = 0, partial
+            if bright is not None:
+                extra = self.device.empty((-(-bright.shape[0] // planning.CHUNK), 4, padded), np.float32)
+                bright_splits = self._partials(lobe, bright, bright.shape[0], block, extra, 0)
+            level = self.device.empty((3, padded), np.float32)
+            lanes = self.device.lanes(32)
+            self.device.launch(finish, (padded // lanes,),
+                               (level, np.int32(padded), partial, np.int32(splits), extra, np.int32(bright_splits),
+                                np.float32(1 / lobe.norm)))
+            out[begin:begin + used] = level.read().T[:used]
+            self.progress(lobe.name, share[0] + (share[1] - share[0]) * (begin + used) / shape.count)
+        return out.reshape(*shape.dims, 3)
+
+    def exact(self, wanted: Sequence[tuple[Lobe, np.ndarray]], cuts: int) -> list[np.ndarray]:
+        """For each (lobe, directions (3, m)): the integral over every texel, (m, 3) float64, in one pass.
+
+        The spherical harmonics of the same nodes are kept for `harmonics`.
+        """
+        jobs = []
+        for lobe, directions in wanted:
+            _, _, step = self._lobe(lobe)
+            step *= self.device.local_size
+            padded = -(-directions.shape[1] // step) * step
+            block = np.pad(directions, ((0, 0), (0, padded - directions.shape[1])), mode="edge")
+            jobs.append((lobe, self.device.array(block.astype(np.float32)),
+                         self.device.empty((planning.NODES_A_BAND // planning.CHUNK, 4, padded), np.float32),
+                         np.zeros((4, padded))))
+        chunks = -(-planning.NODES_A_BAND // HARMONICS_CHUNK)
+        partial = self.device.empty((chunks, 28), np.float32)
+        coefficients = np.zeros(28)
+        for listed, count, _share in self._bands(cuts):
+            used = -(-count // HARMONICS_CHUNK)
+            self._launch(self._texel_kernel("harmonics"), used,
+                         (partial, np.int32(count), np.int32(HARMONICS_CHUNK), np.int32(0), listed))
+            splits = [self._partials(lobe, listed, count, block, sums, 0) for lobe, block, sums, _ in jobs]
+            coefficients += partial.read()[:used].sum(0, dtype=np.float64)
+            for (_, _, sums, total_sums), n in zip(jobs, splits, strict=True):
+                total_sums += sums.read()[:n].sum(0, dtype=np.float64)
+        self._harmonics[cuts] = coefficients
+        return [(sums[:3] / sums[3]).T[:directions.shape[1]]
+                for (_, directions), (_, _, _, sums) in zip(wanted, jobs, strict=True)]
+
+    def harmonics(self) -> tuple[np.ndarray, float]:
+        """Radiance coefficients (9, 3) in float64 from nodes of every texel, and their error over the largest
+        L00: the difference to half as many nodes an edge, which bounds the finer rule's, and float32's part."""
+        cuts = max(2, planning.cuts_for(self.texel, 0.5, 1e-6))
+        fewer = 1 if cuts == 2 else 2 * (cuts // 4)
+        for c in (cuts, fewer):
+            if c not in self._harmonics:
+                self.exact([], c)
+        sums = self._harmonics[cuts]
+        level = float(np.abs(sums[:3]).max())
+        error = float(np.abs(self._harmonics[fewer][:27] - sums[:27]).max()) / level + 1e-6 if level > 0 else 0.0
+        return sums[:27].reshape(9, 3) / self.scale, error
+
+    def exact_means(self, shape: Shape, index: np.ndarray) -> np.ndarray:
+        """The mean of the source over chosen texels of `shape`, (m, 3), in float64 and in another form."""
+        from whitefurnace.catalogue.overlap import mean_over_texels
+        return mean_over_texels(self._texels, self.environment.rotation, shape.latlong, shape.size, index)
+
+    # ------------------------------------------------------------------------------------------- level 0
+
+    def means(self, shape: Shape) -> np.ndarray:
+        """The mean source radiance over each texel of `shape`, (dims, 3) float32, by exact overlaps."""
+        if self._same_texels(shape):
+            return self._texels.copy()
+        precision = 64 if self.device.fp64 else 32
+        program = self.device.build(source.overlap().text, {"W": 1, "T": 1, "PRECISION": precision})
+        real = np.dtype(f"f{precision // 8}").type
+        if not self.latlong:
+            return self._means_of_cube(program, shape, real)
+        if shape.latlong:
+            level = self.device.empty((*shape.dims, 3), np.float32)
+            self._launch(program.kernel("mean_latlong"), shape.count,
+                         (level, np.int32(shape.size), np.int32(2 * shape.size), np.int32(self.rows),
+                          np.int32(self.columns), real(self.environment.rotation),
+                          self.device.array(_row_edges(self.rows, real)),
+                          self.device.array(_row_edges(shape.size, real)), self._radiance))
+            return level.read()
+        return self._means_by_edges(program, shape.size, real)
+
+    def _same_texels(self, shape: Shape) -> bool:
+        return (shape.latlong == self.latlong and self.rows == shape.size and self.environment.rotation == 0
+                and (not self.latlong or self.columns == 2 * self.rows))
+
+    def _means_of_cube(self, program: Any, shape: Shape, real: Any) -> np.ndarray:
+        turn = self.environment.rotation
+        level = self.device.empty((*shape.dims, 3), np.float32)
+        # Sagitta of a chord of a parallel against the texel's height: (Δφ/chords)²/8 : Δθ ≤ 1e-5.
+        chords = min(16, max(2, math.ceil(math.sqrt(math.pi / shape.size / 8 / 1e-5))))
+        tile = 1 << 15
+        for first in range(0, shape.count, tile):
+            count = min(tile, shape.count - first)
+            # A sub-buffer per tile would need alignment; the kernel takes `first` and writes from 0.
+            part = self.device.empty((count, 3), np.float32)
+            self._launch(program.kernel("mean_cube"), count,
+                         (part, np.int32(first), np.int32(count), np.int32(shape.size), np.int32(shape.latlong),
+                          np.int32(chords), np.int32(self.rows), real(math.cos(turn)), real(math.sin(turn)),
+                          self._radiance))
+            if first == 0:
+                out = np.empty((shape.count, 3), np.float32)
+            out[first:first + count] = part.read()
+        del level
+        return out.reshape(*shape.dims, 3)
+
+    def _means_by_edges(self, program: Any, size: int, real: Any) -> np.ndarray:
+        edges = self.device.array(_row_edges(self.rows, real))
+        kind = np.dtype(real)
+        # Bands of rows bound the float64 prefix sums to 64 MiB whatever the source.
+        band = max(1, min(self.rows, (64 << 20) // (3 * self.columns * kind.itemsize)))
+        above = self.device.empty((band, self.columns, 3), kind)
+        sums = np.zeros((2, size + 1, size, 3), kind)
+        faces = [self.device.array(sums, writable=True) for _ in range(6)]
+        zero = self.device.array(np.zeros((self.columns, 3), kind), writable=True)
+        weights = -np.diff(np.cos(np.arange(self.rows + 1) * math.pi / self.rows))
+        total = self.device.array(np.einsum("r,rck->ck", weights, self._texels).astype(kind))
+        for first in range(0, self.rows, band):
+            last = min(first + band, self.rows)
+            self._launch(program.kernel("accumulate_rows"), 3 * self.columns,
+                         (above, zero, np.int32(self.columns), np.int32(first), np.int32(last), edges, self._radiance))
+            for face in range(6):
+                self._launch(program.kernel("cut_edges"), 2 * size * (size + 1),
+                             (faces[face], np.int32(size), np.int32(face), np.int32(self.rows),
+                              np.int32(self.columns), real(self.environment.rotation), np.int32(first),
+                              np.int32(last), edges, above, total, self._radiance))
+        out = np.empty((6, size, size, 3), np.float32)
+        for face in range(6):
+            level = self.device.empty((size, size, 3), np.float32)
+            self._launch(program.kernel("close_texels"), size * size, (level, np.int32(size), faces[face]))
+            out[face] = level.read()
+        return out
+
+    # ------------------------------------------------------------------------------------------- statement
+
+    def sample(self, shape: Shape) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the texels a certificate looks at: (uniform draw, stratum near the brightest sources)."""
+        if shape.count <= planning.UNIFORM + planning.NEAR_BRIGHT:
+            return np.arange(shape.count), np.arange(0)
+        digest = hashlib.sha256(f"{self.seed}/{self.environment.digest}/{shape}".encode()).digest()
+        rng = np.random.default_rng(list(digest))
+        uniform = rng.choice(shape.count, planning.UNIFORM, replace=False)
+        return uniform, self._near_bright(shape)
+
+    def _near_bright(self, shape: Shape) -> np.ndarray:
+        """The NEAR_BRIGHT texels nearest the brightest sources, nearest to any of them."""
+        index, _ = self._bright
+        if not len(index):
+            return np.arange(0)
+        targets = self._texel_centres(index[:8])
+        closeness = (targets @ shape.directions()).max(0)
+        count = min(planning.NEAR_BRIGHT, shape.count)
+        return np.sort(np.argpartition(-closeness, count - 1)[:count])
+
+    def _texel_centres(self, index: np.ndarray) -> np.ndarray:
+        """(m, 3) directions of source texels by flat index."""
+        e = self.environment
+        d = (_latlong_centres(self.rows, self.columns, index) if self.latlong else _cube_directions(self.rows)[:, index])
+        c, s = math.cos(e.rotation), math.sin(e.rotation)
+        return np.stack([c * d[0] - s * d[2], d[1], s * d[0] + c * d[2]], 1)
+
+
+@dataclass(frozen=True)
+class Lobe:
+    """A lobe to convolve with: an NDF at its parameters, or irradiance's cosine (model None)."""
+
+    name: str
+    model: Model | None
+    scalars: tuple[Any, ...]
+    norm: float
+    alpha: float
+
+
+def ndf_lobe(choice: Chosen, roughness: float, parameters: dict[str, float]) -> Lobe:
+    """The prefilter's lobe of an NDF."""
+    entry = choice.model
+    return Lobe(f"r = {roughness:.3f}", entry, tuple(np.float32(parameters[p.name]) for p in entry.parameters),
+                 lobe_norm(entry, parameters), max(roughness * roughness, 1e-5))
+
+
+COSINE = Lobe("irradiance", None, (), math.pi, 1.0)
+
+
+def _composite(cuts: int) -> tuple[np.ndarray, np.ndarray]:
+    """cuts/2 cells of two Gauss points each on [0, 1]."""
+    cells = cuts // 2
+    x, w = gauss(2)
+    nodes = (np.arange(cells)[:, None] + x) / cells
+    return nodes.ravel(), np.tile(w / cells, cells)
+
+
+def _latlong_tables(rows: int, columns: int, x: np.ndarray, w: np.ndarray,
+                    rotation: float) -> tuple[np.ndarray, np.ndarray]:
+    """(cos θ, sin θ, weight) by refined row, each row's weights summing to cos θ0 - cos θ1; and
+    (cos φ, sin φ, weight) by refined column."""
+    theta = (np.arange(rows)[:, None] + x) * (math.pi / rows)
+    weight = np.sin(theta) * w
+    weight *= (-np.diff(np.cos(np.arange(rows + 1) * math.pi / rows)) / weight.sum(1))[:, None]
+    phi = (np.arange(columns)[:, None] + x) * (2 * math.pi / columns) - math.pi + rotation
+    across = np.broadcast_to(w * (2 * math.pi / columns), phi.shape)
+    return (np.stack([np.cos(theta), np.sin(theta), weight], -1).reshape(-1, 3),
+            np.stack([np.cos(phi), np.sin(phi), across], -1).reshape(-1, 3))
+
+
+def _cube_tables(size: int, x: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(coordinate, weight, 0) by refined row; the same by column, followed by the solid-angle corrections."""
+    s = ((np.arange(size)[:, None] + x) * (2 / size) - 1).ravel()
+    weight = np.tile(w * (2 / size), size)
+    density = weight[:, None] * weight * (1 + s[:, None] ** 2 + s**2) ** -1.5
+    plain = density.reshape(size, len(x), size, len(x)).sum((1, 3))
+    table = np.stack([s, weight, np.zeros_like(s)], 1)
+    correction = cube_solid_angles(size) / plain
+    return table, np.concatenate([table.ravel(), correction.ravel()])
+
+
+def _row_edges(rows: int, real: Any) -> np.ndarray:
+    """(cos θ, cot θ) of the rows + 1 edges; the poles' cotangents are ±1e300 (1e30 in float32), never used
+    but as a bound."""
+    theta = np.arange(rows + 1) * math.pi / rows
+    cosine, sine = np.cos(theta), np.sin(theta)
+    if rows % 2 == 0:
+        cosine[rows // 2] = 0.0
+    sine[[0, -1]] = 1e-30
+    return np.stack([cosine, cosine / sine], 1).astype(real)
+
+
+def _latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
+    theta = (index // columns + 0.5) * math.pi / rows
+    phi = (index % columns + 0.5) * 2 * math.pi / columns - math.pi
+    return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)])
+
+
+@cache
+def _coarsening(fine: int, coarse: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The interpolation matrix (fine, coarse) between equiangular nodes, and for each coarse node the range
+    [first, last) of fine nodes it takes part in."""
+    order = min(planning.ORDER, coarse)
+    x = (2 * np.arange(fine) + 1) / fine / 2 * coarse - 0.5  # in coarse node numbers
+    start = np.clip(np.floor(x).astype(int) - (order // 2 - 1), 0, coarse - order)
+    matrix = np.zeros((fine, coarse))
+    for a in range(order):
+        weight = np.ones(fine)
+        for b in range(order):
+            if b != a:
+                weight *= (x - (start + b)) / (a - b)
+        matrix[np.arange(fine), start + a] = weight
+    touched = (np.arange(coarse) >= start[:, None]) & (np.arange(coarse) < start[:, None] + order)
+    first = touched.argmax(0)
+    last = fine - touched[::-1].argmax(0)
+    return matrix.astype(np.float32), first.astype(np.int32), last.astype(np.int32)
+
+
+def statement(values: np.ndarray, reference: np.ndarray, uniform: int, solid_angle: np.ndarray,
+              mean: float, total: int) -> tuple[float, float, float]:
+    """(error, worst, rmse) of a level from its sample.
+
+    values, reference: (m, 3), the uniform draw first, then the stratum. solid_angle: (m,). A texel's error is
+    max over channels of |x - ref| / max(ref, 1e-3 · mean), 0/0 = 0. The uniform texels stand for the rest of
+    the level by inverse probability in `rmse`; the stratum for itself.
+    """
+    reference = reference.astype(np.float64)
+    difference = np.abs(values - reference)
+    floor = np.maximum(reference, 1e-3 * mean)
+    errors = np.divide(difference, floor, out=np.zeros_like(difference), where=floor > 0).max(1)
+    weight = solid_angle.copy()
+    stratum = len(values) - uniform
+    weight[:uniform] *= max(total - stratum, 0) / max(uniform, 1)
+    energy = float((weight[:, None] * reference**2).sum())
+    rmse = math.sqrt(float((weight[:, None] * difference**2).sum()) / energy) if energy > 0 else 0.0
+    return float(errors[:uniform].max()), float(errors.max()), rmse

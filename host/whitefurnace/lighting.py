@@ -1,0 +1,274 @@
+"""What an environment gives a renderer: the specular chain, irradiance and spherical harmonics, each certified
+against the exact integral and refined where it misses the tolerance."""
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from whitefurnace import plan as planning
+from whitefurnace.catalogue import Model
+from whitefurnace.convolution import COSINE, ROUNDING, Convolver, Level, Lobe, Progress, Shape, ndf_lobe, statement
+from whitefurnace.device import Device, choose_device
+from whitefurnace.environments import Environment, environment
+from whitefurnace.errors import CheckError, UsageError
+from whitefurnace.plan import LevelPlan
+from whitefurnace.recipe import IRRADIANCE_SIZE, Chain, chain, tolerance_of
+
+
+@dataclass(frozen=True)
+class Prefiltered:
+    """A specular chain. `values` is a tuple of float32 arrays, (6, s, s, 3) a level in the GL-direct layout, or
+    (s, 2 s, 3) as lat-longs; `roughness`, `error`, `worst`, `rmse` are (n,) float64; `evaluations` counts lobe
+    evaluations of the convolution; `seconds` is wall time; `rule` names the method of each level."""
+
+    levels: tuple[Level, ...]
+    seconds: float
+
+    @property
+    def values(self) -> tuple[np.ndarray, ...]:
+        return tuple(level.texels for level in self.levels)
+
+    @property
+    def roughness(self) -> np.ndarray:
+        return np.array([level.roughness for level in self.levels])
+
+    @property
+    def error(self) -> np.ndarray:
+        return np.array([level.error for level in self.levels])
+
+    @property
+    def worst(self) -> np.ndarray:
+        return np.array([level.worst for level in self.levels])
+
+    @property
+    def rmse(self) -> np.ndarray:
+        return np.array([level.rmse for level in self.levels])
+
+    @property
+    def evaluations(self) -> int:
+        return sum(level.pairs for level in self.levels)
+
+    @property
+    def rule(self) -> tuple[str, ...]:
+        return tuple(level.method for level in self.levels)
+
+
+@dataclass(frozen=True)
+class Certified:
+    """An array with its statement: `values`, `error` (p99 of texel errors at 95 % confidence, or for spherical
+    harmonics the largest coefficient error over the largest of L00), `worst`, `rmse`, `evaluations`,
+    `seconds`, `rule`."""
+
+    values: np.ndarray
+    error: float
+    worst: float
+    rmse: float
+    evaluations: int
+    seconds: float
+    rule: str
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.values, dtype=dtype) if dtype or copy else self.values
+
+
+@dataclass(frozen=True)
+class Job:
+    """One level to make: its plan, its lobe (None: the mean over each texel) and where it is evaluated."""
+
+    plan: LevelPlan
+    lobe: Lobe | None
+    shape: Shape
+
+
+def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) -> list[Job]:
+    """The jobs of a specular chain, as cubes, or as lat-longs of twice a face's height."""
+    jobs = []
+    for level in planning.plan_chain(recipe, convolver.texel):
+        lobe = None if level.roughness == 0 else ndf_lobe(recipe.ndf, level.roughness, level.parameters)
+        jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size)))
+    return jobs
+
+
+def irradiance_job(convolver: Convolver, size: int, tolerance: float) -> Job:
+    """The job of the irradiance cube."""
+    return Job(LevelPlan(size, 1.0, {}, planning.grid_size(1.0, tolerance),
+                         planning.cuts_for(convolver.texel, 1.0, tolerance)), COSINE, Shape(False, size))
+
+
+def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> list[Level]:
+    """Makes, certifies and where needed refines every level, in the order of `jobs`.
+
+    Raises CheckError when a level misses the tolerance on the finest grid there is.
+    """
+    # The finest grid first: the coarser ones are made from it.
+    grids = [(job.plan.grid, job.lobe.alpha) for job in jobs if job.lobe]
+    if grids:
+        convolver.prepare(*max(grids))
+    work = [max(job.plan.grid, 1) ** 2 * job.shape.count for job in jobs]
+    done = 0
+    texels, seconds = [], []
+    for job, cost in zip(jobs, work, strict=True):
+        begin = time.perf_counter()
+        texels.append(_make(convolver, job, (0.8 * done / sum(work), 0.8 * (done + cost) / sum(work))))
+        seconds.append(time.perf_counter() - begin)
+        done += cost
+    samples = [convolver.sample(job.shape) for job in jobs]
+    begin = time.perf_counter()
+    references = _references(convolver, jobs, samples)
+    share = (time.perf_counter() - begin) / max(len(jobs), 1)
+    levels = []
+    for k, job in enumerate(jobs):
+        level = _stated(convolver, job, texels[k], samples[k], references[k], seconds[k] + share)
+        while level.error > tolerance:
+            finer = planning.refined(job.plan) if job.lobe else None
+            if finer is None:
+                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g} on its "
+                                 f"finest grid, over the tolerance {tolerance:g}")
+            job = replace(job, plan=finer)
+            begin = time.perf_counter()
+            again = _make(convolver, job, (0.8, 0.8))
+            level = _stated(convolver, job, again, samples[k], references[k],
+                            level.seconds + time.perf_counter() - begin)
+        levels.append(level)
+    return levels
+
+
+def _make(convolver: Convolver, job: Job, share: tuple[float, float]) -> np.ndarray:
+    if job.lobe is None:
+        return convolver.means(job.shape)
+    return convolver.convolve(job.lobe, job.shape, job.plan.grid, job.plan.cuts, share)
+
+
+def _references(convolver: Convolver, jobs: Sequence[Job],
+                samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    """The exact values of each job's sample, (m, 3); lobes with the same cuts share one pass over the texels."""
+    references: list[np.ndarray] = [np.empty(0)] * len(jobs)
+    chosen = [np.concatenate(sample) for sample in samples]
+    for cuts in sorted({job.plan.cuts for job in jobs if job.lobe}):
+        group = [k for k, job in enumerate(jobs) if job.lobe and job.plan.cuts == cuts]
+        wanted = [(jobs[k].lobe, jobs[k].shape.directions()[:, chosen[k]]) for k in group]
+        for k, values in zip(group, convolver.exact(wanted, cuts), strict=True):  # type: ignore[arg-type]
+            references[k] = values
+    for k, job in enumerate(jobs):
+        if job.lobe is None:
+            references[k] = convolver.exact_means(job.shape, chosen[k])
+    return references
+
+
+def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np.ndarray, np.ndarray],
+            reference: np.ndarray, seconds: float) -> Level:
+    uniform, near = sample
+    index = np.concatenate(sample)
+    solid = job.shape.solid_angles()
+    flat = texels.reshape(-1, 3)
+    mean = float((flat * solid[:, None]).sum() / (3 * solid.sum()))
+    error, worst, rmse = statement(flat[index], reference, len(uniform), solid[index], mean, job.shape.count)
+    rounding = ROUNDING if mean > 0 else 0.0
+    if job.lobe is None:
+        method, pairs = "texel-mean", 0
+    else:
+        method, pairs = f"anterpolated-{job.plan.grid}", job.plan.grid**2 * 6 * job.shape.count
+    scaled = (texels.astype(np.float64) / convolver.scale).astype(np.float32)
+    return Level(scaled, job.plan.roughness, error + rounding, worst + rounding, rmse, method, job.plan.grid, pairs,
+                 seconds)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Everything of one environment: levels as cubes and (where asked for) as lat-longs, irradiance, SH."""
+
+    levels: tuple[Level, ...]
+    latlongs: tuple[Level, ...]
+    irradiance: Level
+    sh: np.ndarray
+    sh_error: float
+    energy_kept: tuple[float, ...]
+    coverage: tuple[np.ndarray, ...]
+    latlong_coverage: tuple[np.ndarray, ...]
+    seconds: float
+
+
+def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = False, seed: str = "",
+          progress: Progress | None = None) -> Lighting:
+    """The whole of an environment under one recipe, sharing grids and certificates. Raises CheckError where a
+    level cannot reach the tolerance, DeviceError where the device fails."""
+    begin = time.perf_counter()
+    convolver = Convolver(device, env, seed=seed, progress=progress)
+    jobs = chain_jobs(convolver, recipe)
+    wide = chain_jobs(convolver, recipe, latlong=True) if latlong else []
+    everything = [*jobs, *wide, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance)]
+    levels = run_jobs(convolver, everything, recipe.tolerance)
+    sh, sh_error = convolver.harmonics()
+    kept = tuple(_energy(level.texels) / convolver.energy - 1 if convolver.energy > 0 else 0.0
+                 for level in levels[:len(jobs)])
+    coverage: tuple[np.ndarray, ...] = ()
+    wide_coverage: tuple[np.ndarray, ...] = ()
+    if env.coverage is not None:
+        grey = np.repeat(env.coverage[..., None], 3, -1)
+        alpha = light(device, replace(env, texels=grey, coverage=None, statistics={}), recipe, latlong=latlong,
+                      seed=seed, progress=progress)
+        coverage = tuple(level.texels[..., 0] for level in alpha.levels)
+        wide_coverage = tuple(level.texels[..., 0] for level in alpha.latlongs)
+    return Lighting(tuple(levels[:len(jobs)]), tuple(levels[len(jobs):-1]), levels[-1], sh, sh_error, kept, coverage,
+                    wide_coverage, time.perf_counter() - begin)
+
+
+def _energy(texels: np.ndarray) -> float:
+    """∫ L dω over a cube, all channels together."""
+    omega = Shape(False, texels.shape[1]).solid_angles().reshape(texels.shape[:3])
+    return float(np.einsum("fij,fijc->", omega, texels, dtype=np.float64))
+
+
+def prefilter(source: Any, *, size: int = 256, min_size: int = 16, ndf: str | Model = "ggx",
+              tolerance: float | None = None, quality: str | None = None, rotate: float = 0.0, exposure: float = 0.0,
+              nonfinite: str = "refuse", latlong: bool = False, device: Device | str | None = None) -> Prefiltered:
+    """The specular chain of an environment (a path, an array or an `environment`).
+
+    size, min_size: powers of two, texels a face edge of the first and last level. ndf: an isotropic NDF.
+    tolerance: bound on `error` of every level, default 1e-3; or quality draft, normal, reference. rotate:
+    degrees about +Y; exposure: stops; nonfinite: "refuse" or "zero". latlong: levels as lat-long images of
+    2·size rows. Raises the errors of `environment`, UsageError, UnsupportedError, CheckError, DeviceError.
+    """
+    begin = time.perf_counter()
+    recipe = chain(ndf=ndf, size=size, min_size=min_size, tolerance=tolerance, quality=quality)
+    env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
+    convolver = Convolver(_device(device), env)
+    levels = run_jobs(convolver, chain_jobs(convolver, recipe, latlong=latlong), recipe.tolerance)
+    return Prefiltered(tuple(levels), time.perf_counter() - begin)
+
+
+def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | None = None, rotate: float = 0.0,
+               exposure: float = 0.0, nonfinite: str = "refuse", device: Device | str | None = None) -> Certified:
+    """E/π as a cube (6, size, size, 3) float32: a constant environment of 1 gives 1. Raises as `prefilter`."""
+    if not 1 <= size <= 1024:
+        raise UsageError(f"irradiance size {size} is outside [1, 1024]")
+    begin = time.perf_counter()
+    bound = tolerance_of(tolerance, None)
+    env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
+    convolver = Convolver(_device(device), env)
+    level = run_jobs(convolver, [irradiance_job(convolver, size, bound)], bound)[0]
+    return Certified(level.texels, level.error, level.worst, level.rmse, level.pairs,
+                     time.perf_counter() - begin, level.method)
+
+
+def harmonics(source: Any, *, rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse",
+              device: Device | str | None = None) -> Certified:
+    """Radiance coefficients (9, 3) float64 to degree 2: real orthonormal basis in world x, y, z without the
+    Condon-Shortley sign, in the order L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22. Raises as `prefilter`."""
+    begin = time.perf_counter()
+    env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
+    convolver = Convolver(_device(device), env)
+    values, error = convolver.harmonics()
+    return Certified(values, error, error, error, convolver.faces * convolver.rows * convolver.columns,
+                     time.perf_counter() - begin, "texel-nodes")
+
+
+def _device(device: Device | str | None) -> Device:
+    return device if isinstance(device, Device) else choose_device(device)
+
+
+__all__ = ["Certified", "Lighting", "Prefiltered", "harmonics", "irradiance", "light", "prefilter"]
