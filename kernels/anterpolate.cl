@@ -73,7 +73,7 @@ __kernel void anterpolate(__global scalar *restrict moments, const int n, const 
     const vec3 d = {corner.x - centre.x, corner.y - centre.y, corner.z - centre.z};
     reach = fmax(reach, dot3(d, d));
   }
-  const scalar radius = 2 * asin(sqrt(reach) / 2) * (scalar)1.0001 + (scalar)1e-6;
+  const scalar radius = 2 * asin(sqrt(reach) / 2) * (scalar)1.0001 + (scalar)2e-6;
 
 #if PRECISION == 64
   double4 sum[ORDER][ORDER];
@@ -161,14 +161,17 @@ __kernel void coarsen(__global scalar *restrict out, __global const scalar *rest
   for (int c = 0; c < 4; c++) out[4 * (size_t)g + c] = sum[c];
 }
 
-// The grid as the list that `convolve` reads, its directions from the tangent table of n coordinates.
+// The grid as the list that `convolve` reads, in blocks of 8 × 8 nodes (n is a multiple of 8), its directions from
+// the tangent table of n coordinates.
 __kernel void grid_list(__global scalar *restrict list, const int n, __global const scalar *restrict tangent,
                         __global const scalar *restrict grid) {
   const int g = get_global_id(0);
   if (g >= 6 * n * n) return;
-  const vec3 d = unit3(cube_direction(g / (n * n), tangent[g % n], tangent[g / n % n]));
+  const int face = g / (n * n), i = g / n % n, j = g % n;
+  const vec3 d = unit3(cube_direction(face, tangent[j], tangent[i]));
   __global const scalar *q = grid + 4 * (size_t)g;
-  __global scalar *p = list + 8 * (size_t)g;
+  const int block = (face * (n / 8) + i / 8) * (n / 8) + j / 8;
+  __global scalar *p = list + 8 * ((size_t)block * 64 + i % 8 * 8 + j % 8);
   p[0] = d.x; p[1] = d.y; p[2] = d.z; p[3] = q[3];
   p[4] = q[0]; p[5] = q[1]; p[6] = q[2]; p[7] = 0;
 }

@@ -16,7 +16,8 @@ __kernel void demo(__global float *restrict radiance, const int height, const in
     const scalar c = x * sun_x + y * sun_y + z * sun_z;
     scalar sky[3];
     if (y > 0) {
-      const scalar haze = pow(1 - y, (scalar)6), glow = exp(12 * (c - 1));  // horizon band; aureole
+      const scalar h2 = (1 - y) * (1 - y), haze = h2 * h2 * h2;                  // horizon band
+      const scalar a = fmax(c, (scalar)0), a2 = a * a, a4 = a2 * a2, glow = a4 * a4 * a4;  // aureole
       sky[0] = (scalar)0.18 + (scalar)0.62 * haze + (scalar)1.5 * glow;
       sky[1] = (scalar)0.34 + (scalar)0.50 * haze + (scalar)1.2 * glow;
       sky[2] = (scalar)0.75 + (scalar)0.20 * haze + (scalar)0.8 * glow;

@@ -63,17 +63,17 @@ __kernel void cut_edges(__global scalar *restrict edge, const int size, const in
     const scalar p = half_edge ? fmax(low, (scalar)0) : low, q = half_edge ? high : fmin(high, (scalar)0);
     if (!(q > p)) continue;
     const int c0 = (int)floor((start + p) * per), c1 = (int)floor((start + q) * per);
+    scalar psi = p, asin_psi = asin(B * sin(p));
+    int r = clamp((int)floor((HALF_PI - atan(A * cos(p))) / PI * rows), 0, rows - 1);
     for (int c = c0; c <= c1; c++) {
-      const scalar a = c == c0 ? p : fmax(p, c / per - start), b = c == c1 ? q : fmin(q, (c + 1) / per - start);
-      if (!(b > a)) continue;
+      const scalar b = c == c1 ? q : fmin(q, (c + 1) / per - start);
+      if (!(b > psi)) continue;
       const int column = ((c % columns) + columns) % columns;
-      const int ra = clamp((int)floor((HALF_PI - atan(A * cos(a))) / PI * rows), 0, rows - 1);
-      const int rb = clamp((int)floor((HALF_PI - atan(A * cos(b))) / PI * rows), 0, rows - 1);
-      const int step = ra <= rb ? 1 : -1;
-      scalar psi = a, asin_psi = asin(B * sin(a));
-      for (int r = ra;; r += step) {
+      const int last = clamp((int)floor((HALF_PI - atan(A * cos(b))) / PI * rows), 0, rows - 1);
+      const int step = r <= last ? 1 : -1;
+      for (;; r += step) {
         scalar next = b;
-        if (r != rb) {
+        if (r != last) {
           const scalar cosine = row_edge[2 * (step > 0 ? r + 1 : r) + 1] / A;
           const scalar crossing = acos(clamp(cosine, (scalar)-1, (scalar)1));
           next = clamp(half_edge ? crossing : -crossing, psi, b);
@@ -88,7 +88,7 @@ __kernel void cut_edges(__global scalar *restrict edge, const int size, const in
         }
         psi = next;
         asin_psi = asin_next;
-        if (r == rb) break;
+        if (r == last) break;
       }
     }
   }

@@ -5,38 +5,105 @@
 // scalars. The source is cut into fixed chunks, so that rounding does not grow with its length (393k terms:
 // 5e-5 in one run, 7e-7 in chunks of 8192) and the result does not depend on the device.
 // partial: [split][4][outputs] = ∑K wL (rgb) and ∑K w. direction: [3][outputs]; outputs a multiple of W·T.
+
+// A sharp lobe needs a fine grid near r only. K = K (1 - ω) + K ω with ω a smooth step in s from 0 at s0 to 1
+// at s1: the first part has compact support and goes over the fine grid, whole blocks of sources skipped; the
+// second is smooth on the scale √(2 s1) and goes over a coarse grid. The sum is K exactly.
+#define WHOLE 0
+#define FAR 1
+#define NEAR 2
+#define BLOCK 64
+
+typedef struct {
+  scalar s0, per_s;  // ω's start and 1/(s1 - s0)
+} Window;
+
+static inline real step_up(real s, Window window) {
+  const real t = fmin(fmax((s - window.s0) * window.per_s, (real)0), (real)1), t2 = t * t;
+  return t2 * t2 * (35 + t * (-84 + t * (70 - 20 * t)));  // three continuous derivatives
+}
+
+typedef struct {
+  real x[T], y[T], z[T], sum[4][T];
+} Outputs;
+
+static inline void load_outputs(Outputs *o, int g, int outputs, __global const scalar *restrict direction) {
+  for (int t = 0; t < T; t++) {
+    o->x[t] = LOAD(g + t, direction);
+    o->y[t] = LOAD(g + t, direction + outputs);
+    o->z[t] = LOAD(g + t, direction + 2 * outputs);
+    for (int c = 0; c < 4; c++) o->sum[c][t] = (real)0;
+  }
+}
+
+static inline void add_sources(Outputs *o, __global const scalar *restrict source, int begin, int end, const int part,
+                               Window window NDF_SCALARS) {
+  for (int k = begin; k < end; k++) {
+    __global const scalar *restrict p = source + 8 * (size_t)k;
+    const scalar px = p[0], py = p[1], pz = p[2], pw = p[3], pr = p[4], pg = p[5], pb = p[6];
+    for (int t = 0; t < T; t++) {
+      const real dx = o->x[t] - px, dy = o->y[t] - py, dz = o->z[t] - pz;
+      const real s = (scalar)0.5 * (dx * dx + dy * dy + dz * dz);
+      real K = lobe(s NDF_VALUES);
+      if (part == FAR) K *= step_up(s, window);
+      if (part == NEAR) K *= 1 - step_up(s, window);
+      o->sum[0][t] += K * pr;
+      o->sum[1][t] += K * pg;
+      o->sum[2][t] += K * pb;
+      o->sum[3][t] += K * pw;
+    }
+  }
+}
+
+static inline void store_outputs(Outputs *o, int g, int outputs, __global scalar *restrict partial) {
+  for (int t = 0; t < T; t++)
+    for (int c = 0; c < 4; c++) STORE(o->sum[c][t], g + t, partial + (size_t)c * outputs);
+}
+
 __kernel void convolve(__global scalar *restrict partial, const int outputs, const int sources, const int chunk,
                        const int first_split, __global const scalar *restrict direction,
                        __global const scalar *restrict source NDF_SCALARS) {
   const int g = get_global_id(0) * T, split = get_global_id(1);
   if ((g + T) * W > outputs) return;
-  real x[T], y[T], z[T], r[T], gr[T], b[T], n[T];
-  for (int t = 0; t < T; t++) {
-    x[t] = LOAD(g + t, direction);
-    y[t] = LOAD(g + t, direction + outputs);
-    z[t] = LOAD(g + t, direction + 2 * outputs);
-    r[t] = gr[t] = b[t] = n[t] = (real)0;
+  const Window none = {0, 0};
+  Outputs o;
+  load_outputs(&o, g, outputs, direction);
+  add_sources(&o, source, split * chunk, min(sources, (split + 1) * chunk), WHOLE, none NDF_VALUES);
+  store_outputs(&o, g, outputs, partial + (size_t)(first_split + split) * 4 * outputs);
+}
+
+__kernel void convolve_far(__global scalar *restrict partial, const int outputs, const int sources, const int chunk,
+                           const int first_split, __global const scalar *restrict direction,
+                           __global const scalar *restrict source, const scalar s0, const scalar s1 NDF_SCALARS) {
+  const int g = get_global_id(0) * T, split = get_global_id(1);
+  if ((g + T) * W > outputs) return;
+  const Window window = {s0, 1 / (s1 - s0)};
+  Outputs o;
+  load_outputs(&o, g, outputs, direction);
+  add_sources(&o, source, split * chunk, min(sources, (split + 1) * chunk), FAR, window NDF_VALUES);
+  store_outputs(&o, g, outputs, partial + (size_t)(first_split + split) * 4 * outputs);
+}
+
+// group, block: {x, y, z, radius} of the W·T outputs of a work item and of BLOCK sources, as chords: a block is
+// skipped when no pair can be nearer than the window's end, by the triangle inequality.
+__kernel void convolve_near(__global scalar *restrict partial, const int outputs, const int sources, const int chunk,
+                            const int first_split, __global const scalar *restrict direction,
+                            __global const scalar *restrict source, const scalar s0, const scalar s1,
+                            __global const scalar *restrict group, __global const scalar *restrict block NDF_SCALARS) {
+  const int item = get_global_id(0), g = item * T, split = get_global_id(1);
+  if ((g + T) * W > outputs) return;
+  const Window window = {s0, 1 / (s1 - s0)};
+  const scalar cx = group[4 * item], cy = group[4 * item + 1], cz = group[4 * item + 2];
+  const scalar reach = sqrt(2 * s1) + group[4 * item + 3];
+  Outputs o;
+  load_outputs(&o, g, outputs, direction);
+  for (int k = split * chunk; k < min(sources, (split + 1) * chunk); k += BLOCK) {
+    __global const scalar *b = block + 4 * (k / BLOCK);
+    const scalar dx = b[0] - cx, dy = b[1] - cy, dz = b[2] - cz, apart = reach + b[3];
+    if (dx * dx + dy * dy + dz * dz > apart * apart) continue;
+    add_sources(&o, source, k, k + BLOCK, NEAR, window NDF_VALUES);
   }
-  const int end = min(sources, (split + 1) * chunk);
-  for (int k = split * chunk; k < end; k++) {
-    __global const scalar *restrict p = source + 8 * (size_t)k;
-    const scalar px = p[0], py = p[1], pz = p[2], pw = p[3], pr = p[4], pg = p[5], pb = p[6];
-    for (int t = 0; t < T; t++) {
-      real dx = x[t] - px, dy = y[t] - py, dz = z[t] - pz;
-      real K = lobe((scalar)0.5 * (dx * dx + dy * dy + dz * dz) NDF_VALUES);
-      r[t] += K * pr;
-      gr[t] += K * pg;
-      b[t] += K * pb;
-      n[t] += K * pw;
-    }
-  }
-  partial += (size_t)(first_split + split) * 4 * outputs;
-  for (int t = 0; t < T; t++) {
-    STORE(r[t], g + t, partial);
-    STORE(gr[t], g + t, partial + outputs);
-    STORE(b[t], g + t, partial + 2 * outputs);
-    STORE(n[t], g + t, partial + 3 * outputs);
-  }
+  store_outputs(&o, g, outputs, partial + (size_t)(first_split + split) * 4 * outputs);
 }
 
 // level[c] = ∑_splits rgb / ∑_splits w + bright[c] · bright_norm, planar [3][outputs].

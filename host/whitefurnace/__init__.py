@@ -8,13 +8,11 @@ The names below are the public interface; OpenCL and image libraries are importe
 from __future__ import annotations
 
 import importlib
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
-try:
-    __version__ = version("whitefurnace")
-except PackageNotFoundError:  # run from a tree that is not installed
-    __version__ = "0+unknown"
+from whitefurnace.version import VERSION
+
+__version__ = VERSION
 
 _HOMES = {
     "bake": "baking",

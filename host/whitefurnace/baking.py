@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-import whitefurnace
 from whitefurnace import source
 from whitefurnace.catalogue import INTEGRALS, model
 from whitefurnace.device import Device, choose_device
@@ -25,6 +24,7 @@ from whitefurnace.lighting import Lighting, light
 from whitefurnace.plan import LevelPlan, plan_chain
 from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain
 from whitefurnace.run import Integrated, dfg
+from whitefurnace.version import VERSION
 
 DEMO = "demo"
 DEMO_HEIGHT = 512
@@ -44,7 +44,7 @@ def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
     count = -(-2 * height * height // size) * size
     sun = [math.sin(theta) * math.cos(phi), math.cos(theta), math.sin(theta) * math.sin(phi)]
     device.launch(program.kernel("demo"), (count,),
-                  (image, np.int32(height), np.int32(8), *(np.float32(x) for x in sun),
+                  (image, np.int32(height), np.int32(4), *(np.float32(x) for x in sun),
                    np.float32(math.cos(SUN_RADIUS)), np.float32(SUN_RADIANCE)))
     return replace(environment(image.read()), name=DEMO)
 
@@ -168,7 +168,7 @@ def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_
     manifest = _manifest(env, recipe, key, on, lit, table)
     with Transaction() as transaction:
         digests = {}
-        provenance = {"whitefurnace": whitefurnace.__version__, "key": key, "source": env.digest,
+        provenance = {"whitefurnace": VERSION, "key": key, "source": env.digest,
                       "recipe": json.dumps(recipe, sort_keys=True)}
         for target in _targets(request, name, lit, table, provenance):
             assert target.write is not None
@@ -198,7 +198,7 @@ def _key(env: Environment, recipe: dict[str, Any]) -> str:
     slots = {"ndf": ndf, "masking": model("masking", "smith")}
     texts = [source.texels(env.kind), source.overlap(), source.convolution(ndf), source.convolution(None),
              source.integration(INTEGRALS["dfg"], slots)]
-    parts = [whitefurnace.__version__, env.digest, json.dumps(recipe, sort_keys=True), *(t.digest for t in texts)]
+    parts = [VERSION, env.digest, json.dumps(recipe, sort_keys=True), *(t.digest for t in texts)]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
@@ -258,7 +258,7 @@ def _manifest(env: Environment, recipe: dict[str, Any], key: str, device: Device
         return data if kept is None else {**data, "energy_kept": 1 + kept}
 
     return {
-        "whitefurnace": whitefurnace.__version__,
+        "whitefurnace": VERSION,
         "name": env.name,
         "key": key,
         "recipe": recipe,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -16,9 +15,8 @@ from whitefurnace import plan as planning
 from whitefurnace import source
 from whitefurnace.catalogue import Model
 from whitefurnace.catalogue.rule import gauss
-from whitefurnace.device import Buffer, Device, Kernel
+from whitefurnace.device import Buffer, Device, Kernel, Program
 from whitefurnace.environments import Environment, cube_solid_angles, latlong_solid_angles
-
 from whitefurnace.recipe import Chosen
 
 Progress = Callable[[str, float], None]
@@ -68,6 +66,14 @@ class Shape:
     def directions(self) -> np.ndarray:
         return _latlong_directions(self.size) if self.latlong else _cube_directions(self.size)
 
+    def tiled(self) -> np.ndarray:
+        """Flat indices in an order that keeps neighbours together: tiles of 8 × 8, row by row."""
+        index = np.arange(self.count).reshape(-1, *self.dims[-2:])
+        planes, height, width = index.shape
+        if height % 8 or width % 8:
+            return index.ravel()
+        return index.reshape(planes, height // 8, 8, width // 8, 8).transpose(0, 1, 3, 2, 4).ravel()
+
     def solid_angles(self) -> np.ndarray:
         """(count,) float64."""
         if self.latlong:
@@ -93,6 +99,26 @@ def _latlong_directions(height: int) -> np.ndarray:
     phi = (np.arange(2 * height) + 0.5) * math.pi / height - math.pi
     theta, phi = np.meshgrid(theta, phi, indexing="ij")
     return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)]).reshape(3, -1)
+
+
+@cache
+def _grid_directions(n: int) -> np.ndarray:
+    """(3, 6 n²) directions of the equiangular nodes, in the order of `grid_list`."""
+    u = np.tan(((2 * np.arange(n) + 1) / n - 1) * math.pi / 4)
+    t, s = (a.ravel() for a in np.meshgrid(u, u, indexing="ij"))
+    o = np.ones_like(s)
+    faces = [(o, -t, -s), (-o, -t, s), (s, o, t), (s, -o, -t), (s, -t, o), (-s, -t, -o)]
+    order = Shape(False, n).tiled()
+    d = np.array([np.stack(f) for f in faces]).transpose(1, 0, 2).reshape(3, -1)[:, order]
+    return d / np.sqrt((d * d).sum(0))
+
+
+def _bounds(directions: np.ndarray, count: int) -> np.ndarray:
+    """(m, 4): centre and largest chord to it, of each `count` consecutive directions (3, m·count)."""
+    d = directions.reshape(3, -1, count)
+    centre = d.mean(2)
+    radius = np.sqrt(((d - centre[..., None]) ** 2).sum(0).max(1))
+    return np.concatenate([centre, radius[None] * (1 + 1e-6) + 1e-6]).T.copy()
 
 
 def lobe_norm(ndf: Model, parameters: dict[str, float]) -> float:
@@ -130,6 +156,7 @@ class Convolver:
         self.scale = 2.0 ** -round(math.log2(mean)) if mean > 0 and math.isfinite(mean) else 1.0
         texels = device.aligned_empty(e.texels.shape, np.float32)
         np.multiply(e.texels, np.float32(self.scale), out=texels)
+        self.constant = not np.ptp(texels.reshape(-1, 3), axis=0).any()
         self.texel = math.pi / self.rows if self.latlong else math.pi / 2 / self.rows
         self._omega = omega
         self._texels = texels
@@ -166,6 +193,9 @@ class Convolver:
         clipped[index] = original * keep[:, None]
         excess = original - clipped[index]
         real = excess.any(1)
+        total = float(energy.sum(dtype=np.float64))
+        self.share = float(level) / total if total > 0 else 0.0
+        self.bright_share = float(flat[index[0]]) / total if total > 0 else 0.0
         return self.device.array(clipped), (index[real], excess[real])
 
     def _table(self, cuts: int) -> tuple[Buffer, Buffer]:
@@ -230,6 +260,7 @@ class Convolver:
         return self._grids[n]
 
     def _bright_list(self, cuts: int) -> Buffer | None:
+        """The excess of the bright texels as a list, each cut into cuts × cuts nodes."""
         index, excess = self._bright
         if not len(index):
             return None
@@ -239,93 +270,127 @@ class Convolver:
                       self.device.array(excess), *self._texel_arguments(cuts, self._clipped)))
         return listed
 
+    def _bright_cuts(self, lobe: Lobe, tolerance: float) -> int:
+        return max(2, planning.cuts_for(self.texel, lobe.alpha, tolerance, self.bright_share))
+
     def _bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
-        """Every node of the unclipped source, in bands: (list, nodes in it, share done)."""
+        """Every node of the clipped source, in bands: (list, nodes in it, share done)."""
         total = self.faces * self.rows * self.columns * cuts * cuts
         listed = self.device.empty((min(planning.NODES_A_BAND, total), 8), np.float32)
         for first in range(0, total, planning.NODES_A_BAND):
             count = min(planning.NODES_A_BAND, total - first)
             self._launch(self._texel_kernel("nodes"), count,
-                         (listed, np.int32(first), np.int32(count), *self._texel_arguments(cuts, self._radiance)))
+                         (listed, np.int32(first), np.int32(count), *self._texel_arguments(cuts, self._clipped)))
             yield listed, count, (first + count) / total
 
     # ------------------------------------------------------------------------------------------- lobes
 
-    def _lobe(self, lobe: Lobe, precision: int = 32) -> tuple[Kernel, Kernel, int]:
-        lanes = self.device.lanes(precision)
-        vectors = self.device.vectors if precision == 32 else 1
-        program = self.device.build(source.convolution(lobe.model).text,
-                                    {"W": lanes, "T": vectors, "PRECISION": precision})
-        return program.kernel("convolve"), program.kernel("finish"), lanes * vectors
+    def _program(self, lobe: Lobe) -> Program:
+        return self.device.build(source.convolution(lobe.model).text,
+                                 {"W": self.device.lanes(32), "T": self.device.vectors, "PRECISION": 32})
 
     def _partials(self, lobe: Lobe, listed: Buffer, count: int, directions: Buffer, partial: Buffer, first: int,
-                  ) -> int:
+                  part: str = "convolve", *window: Any) -> int:
         """Adds ⌈count/CHUNK⌉ partial sums of a list to `partial` from split `first` on; how many they were."""
-        convolve, _, step = self._lobe(lobe)
+        kernel = self._program(lobe).kernel(part)
+        step = self._step
         outputs = directions.shape[1]
         splits = -(-count // planning.CHUNK)
-        self.device.launch(convolve, (outputs // step, splits),
+        self.device.launch(kernel, (outputs // step, splits),
                            (partial, np.int32(outputs), np.int32(count), np.int32(planning.CHUNK), np.int32(first),
-                            directions, listed, *lobe.scalars))
+                            directions, listed, *window, *lobe.scalars))
         return splits
 
-    def convolve(self, lobe: Lobe, shape: Shape, n: int, cuts: int, share: tuple[float, float]) -> np.ndarray:
+    @property
+    def _step(self) -> int:
+        """Outputs of one work item."""
+        return self.device.lanes(32) * self.device.vectors
+
+    def convolve(self, lobe: Lobe, shape: Shape, n: int, tolerance: float,
+                 share: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
         """The level over all directions of `shape` from the n × n grid and the bright texels, (dims, 3)."""
-        listed, bright = self._grid(n, lobe.alpha), self._bright_list(max(2, cuts))
-        _, finish, step = self._lobe(lobe)
-        step *= self.device.local_size
+        split = planning.split_for(n, lobe.alpha)
+        listed, bright = self._grid(n, lobe.alpha), self._bright_list(self._bright_cuts(lobe, tolerance))
+        far = self._grid(split.grid, lobe.alpha) if split else None
+        blocks = self.device.array(_bounds(_grid_directions(n), 64).astype(np.float32)) if split else None
+        group = self._step
+        step = group * self.device.local_size
         count = listed.shape[0]
-        tile = max(planning.PAIRS_A_LAUNCH // count // step, 1) * step
+        pairs = planning.pairs_of(1, n, lobe.alpha)
+        tile = max(planning.PAIRS_A_LAUNCH // pairs // step, 1) * step
+        order = shape.tiled()
         directions = shape.directions()
         out = np.empty((shape.count, 3), np.float32)
         for begin in range(0, shape.count, tile):
-            part = directions[:, begin:begin + tile]
-            used = part.shape[1]
-            padded = -(-used // step) * step
-            block = self.device.array(np.pad(part, ((0, 0), (0, padded - used)), mode="edge").astype(np.float32))
-            partial = self.device.empty((-(-count // planning.CHUNK), 4, padded), np.float32)
-            splits = self._partials(lobe, listed, count, block, partial, 0)
+            index = order[begin:begin + tile]
+            padded = -(-len(index) // step) * step
+            part = np.pad(directions[:, index], ((0, 0), (0, padded - len(index))), mode="edge")
+            block = self.device.array(part.astype(np.float32))
+            chunks = -(-count // planning.CHUNK) + (-(-far.shape[0] // planning.CHUNK) if far else 0)
+            partial = self.device.empty((chunks, 4, padded), np.float32)
+            if split and far and blocks:
+                window = np.float32(split.s0), np.float32(split.s1)
+                groups = self.device.array(_bounds(part, group).astype(np.float32))
+                splits = self._partials(lobe, listed, count, block, partial, 0, "convolve_near", *window, groups, blocks)
+                splits += self._partials(lobe, far, far.shape[0], block, partial, splits, "convolve_far", *window)
+            else:
+                splits = self._partials(lobe, listed, count, block, partial, 0)
             bright_splits, extra = 0, partial
             if bright is not None:
                 extra = self.device.empty((-(-bright.shape[0] // planning.CHUNK), 4, padded), np.float32)
                 bright_splits = self._partials(lobe, bright, bright.shape[0], block, extra, 0)
             level = self.device.empty((3, padded), np.float32)
-            lanes = self.device.lanes(32)
-            self.device.launch(finish, (padded // lanes,),
+            self.device.launch(self._program(lobe).kernel("finish"), (padded // self.device.lanes(32),),
                                (level, np.int32(padded), partial, np.int32(splits), extra, np.int32(bright_splits),
                                 np.float32(1 / lobe.norm)))
-            out[begin:begin + used] = level.read().T[:used]
-            self.progress(lobe.name, share[0] + (share[1] - share[0]) * (begin + used) / shape.count)
+            out[index] = level.read().T[:len(index)]
+            self.progress(lobe.name, share[0] + (share[1] - share[0]) * (begin + len(index)) / shape.count)
         return out.reshape(*shape.dims, 3)
 
-    def exact(self, wanted: Sequence[tuple[Lobe, np.ndarray]], cuts: int) -> list[np.ndarray]:
+    def exact(self, wanted: Sequence[tuple[Lobe, np.ndarray]], cuts: int, tolerance: float = 1e-3) -> list[np.ndarray]:
         """For each (lobe, directions (3, m)): the integral over every texel, (m, 3) float64, in one pass.
 
-        The spherical harmonics of the same nodes are kept for `harmonics`.
+        Bright texels are cut twice as fine as `convolve` cuts them. The spherical harmonics of the same nodes
+        are kept for `harmonics`.
         """
         jobs = []
+        step = self._step * self.device.local_size
         for lobe, directions in wanted:
-            _, _, step = self._lobe(lobe)
-            step *= self.device.local_size
             padded = -(-directions.shape[1] // step) * step
             block = np.pad(directions, ((0, 0), (0, padded - directions.shape[1])), mode="edge")
-            jobs.append((lobe, self.device.array(block.astype(np.float32)),
-                         self.device.empty((planning.NODES_A_BAND // planning.CHUNK, 4, padded), np.float32),
-                         np.zeros((4, padded))))
-        chunks = -(-planning.NODES_A_BAND // HARMONICS_CHUNK)
-        partial = self.device.empty((chunks, 28), np.float32)
+            jobs.append((lobe, self.device.array(block.astype(np.float32)), np.zeros((4, padded))))
         coefficients = np.zeros(28)
         for listed, count, _share in self._bands(cuts):
-            used = -(-count // HARMONICS_CHUNK)
-            self._launch(self._texel_kernel("harmonics"), used,
-                         (partial, np.int32(count), np.int32(HARMONICS_CHUNK), np.int32(0), listed))
-            splits = [self._partials(lobe, listed, count, block, sums, 0) for lobe, block, sums, _ in jobs]
-            coefficients += partial.read()[:used].sum(0, dtype=np.float64)
-            for (_, _, sums, total_sums), n in zip(jobs, splits, strict=True):
-                total_sums += sums.read()[:n].sum(0, dtype=np.float64)
+            coefficients += self._harmonic_sums(listed, count)
+            for lobe, block, sums in jobs:
+                sums += self._list_sums(lobe, listed, count, block)
+        results = []
+        fine = 2 * max((self._bright_cuts(lobe, tolerance) for lobe, _ in wanted), default=2)
+        bright = self._bright_list(fine)
+        if bright is not None:
+            extra = self._harmonic_sums(bright, bright.shape[0])
+            coefficients[:27] += extra[:27]
+        for (_, directions), (lobe, block, sums) in zip(wanted, jobs, strict=True):
+            value = sums[:3] / sums[3]
+            if bright is not None:
+                value += self._list_sums(lobe, bright, bright.shape[0], block)[:3] / lobe.norm
+            results.append(value.T[:directions.shape[1]])
         self._harmonics[cuts] = coefficients
-        return [(sums[:3] / sums[3]).T[:directions.shape[1]]
-                for (_, directions), (_, _, _, sums) in zip(wanted, jobs, strict=True)]
+        return results
+
+    def _list_sums(self, lobe: Lobe, listed: Buffer, count: int, block: Buffer) -> np.ndarray:
+        """(4, outputs) float64: ∑K wL and ∑K w of a whole list."""
+        partial = self.device.empty((-(-count // planning.CHUNK), 4, block.shape[1]), np.float32)
+        self._partials(lobe, listed, count, block, partial, 0)
+        return partial.read().sum(0, dtype=np.float64)
+
+    def _harmonic_sums(self, listed: Buffer, count: int) -> np.ndarray:
+        """(28,) float64: 9 × 3 coefficients of a list, and ∑w."""
+        chunks = -(-count // HARMONICS_CHUNK)
+        partial = self.device.empty((chunks, 28), np.float32)
+        self._launch(self._texel_kernel("harmonics"), chunks,
+                     (partial, np.int32(count), np.int32(HARMONICS_CHUNK), np.int32(0), listed))
+        return partial.read().sum(0, dtype=np.float64)
 
     def harmonics(self) -> tuple[np.ndarray, float]:
         """Radiance coefficients (9, 3) in float64 from nodes of every texel, and their error over the largest

@@ -87,7 +87,7 @@ class Job:
 def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) -> list[Job]:
     """The jobs of a specular chain, as cubes, or as lat-longs of twice a face's height."""
     jobs = []
-    for level in planning.plan_chain(recipe, convolver.texel):
+    for level in planning.plan_chain(recipe, convolver.texel, convolver.share):
         lobe = None if level.roughness == 0 else ndf_lobe(recipe.ndf, level.roughness, level.parameters)
         jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size)))
     return jobs
@@ -96,7 +96,7 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) ->
 def irradiance_job(convolver: Convolver, size: int, tolerance: float) -> Job:
     """The job of the irradiance cube."""
     return Job(LevelPlan(size, 1.0, {}, planning.grid_size(1.0, tolerance),
-                         planning.cuts_for(convolver.texel, 1.0, tolerance)), COSINE, Shape(False, size))
+                         planning.cuts_for(convolver.texel, 1.0, tolerance, convolver.share)), COSINE, Shape(False, size))
 
 
 def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> list[Level]:
@@ -108,17 +108,17 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
     grids = [(job.plan.grid, job.lobe.alpha) for job in jobs if job.lobe]
     if grids:
         convolver.prepare(*max(grids))
-    work = [max(job.plan.grid, 1) ** 2 * job.shape.count for job in jobs]
+    work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0) for job in jobs]
     done = 0
     texels, seconds = [], []
     for job, cost in zip(jobs, work, strict=True):
         begin = time.perf_counter()
-        texels.append(_make(convolver, job, (0.8 * done / sum(work), 0.8 * (done + cost) / sum(work))))
+        texels.append(_make(convolver, job, tolerance, (0.8 * done / sum(work), 0.8 * (done + cost) / sum(work))))
         seconds.append(time.perf_counter() - begin)
         done += cost
     samples = [convolver.sample(job.shape) for job in jobs]
     begin = time.perf_counter()
-    references = _references(convolver, jobs, samples)
+    references = _references(convolver, jobs, samples, tolerance)
     share = (time.perf_counter() - begin) / max(len(jobs), 1)
     levels = []
     for k, job in enumerate(jobs):
@@ -130,28 +130,28 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
                                  f"finest grid, over the tolerance {tolerance:g}")
             job = replace(job, plan=finer)
             begin = time.perf_counter()
-            again = _make(convolver, job, (0.8, 0.8))
+            again = _make(convolver, job, tolerance, (0.8, 0.8))
             level = _stated(convolver, job, again, samples[k], references[k],
                             level.seconds + time.perf_counter() - begin)
         levels.append(level)
     return levels
 
 
-def _make(convolver: Convolver, job: Job, share: tuple[float, float]) -> np.ndarray:
+def _make(convolver: Convolver, job: Job, tolerance: float, share: tuple[float, float]) -> np.ndarray:
     if job.lobe is None:
         return convolver.means(job.shape)
-    return convolver.convolve(job.lobe, job.shape, job.plan.grid, job.plan.cuts, share)
+    return convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance, share)
 
 
 def _references(convolver: Convolver, jobs: Sequence[Job],
-                samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+                samples: Sequence[tuple[np.ndarray, np.ndarray]], tolerance: float) -> list[np.ndarray]:
     """The exact values of each job's sample, (m, 3); lobes with the same cuts share one pass over the texels."""
     references: list[np.ndarray] = [np.empty(0)] * len(jobs)
     chosen = [np.concatenate(sample) for sample in samples]
     for cuts in sorted({job.plan.cuts for job in jobs if job.lobe}):
         group = [k for k, job in enumerate(jobs) if job.lobe and job.plan.cuts == cuts]
         wanted = [(jobs[k].lobe, jobs[k].shape.directions()[:, chosen[k]]) for k in group]
-        for k, values in zip(group, convolver.exact(wanted, cuts), strict=True):  # type: ignore[arg-type]
+        for k, values in zip(group, convolver.exact(wanted, cuts, tolerance), strict=True):  # type: ignore[arg-type]
             references[k] = values
     for k, job in enumerate(jobs):
         if job.lobe is None:
@@ -168,10 +168,12 @@ def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np
     mean = float((flat * solid[:, None]).sum() / (3 * solid.sum()))
     error, worst, rmse = statement(flat[index], reference, len(uniform), solid[index], mean, job.shape.count)
     rounding = ROUNDING if mean > 0 else 0.0
+    if mean > 0 and job.lobe is not None and job.plan.cuts == 1 and not convolver.constant:
+        rounding += planning.KINK_ERROR * convolver.texel  # what the reference itself may be off by
     if job.lobe is None:
         method, pairs = "texel-mean", 0
     else:
-        method, pairs = f"anterpolated-{job.plan.grid}", job.plan.grid**2 * 6 * job.shape.count
+        method, pairs = f"anterpolated-{job.plan.grid}", planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha)
     scaled = (texels.astype(np.float64) / convolver.scale).astype(np.float32)
     return Level(scaled, job.plan.roughness, error + rounding, worst + rounding, rmse, method, job.plan.grid, pairs,
                  seconds)

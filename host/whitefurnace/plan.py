@@ -25,7 +25,7 @@ NODES_A_BAND = 1 << 18
 # Nodes a face edge for a p99 error of 1e-3 on the hardest of the measured environments (studio, forest): the
 # sharp term follows the lobe's width, the floor the kink of (n·l)₊ at the horizon, which rough lobes carry to
 # full height. The error falls like n^-ORDER, so other tolerances scale n by (1e-3/tolerance)^(1/ORDER).
-SHARP, MARGIN, FLOOR, KINK = 2.75, 12, 28, 26
+SHARP, MARGIN, FLOOR, KINK = 3.2, 12, 28, 44
 LARGEST_GRID = 2048
 GROWTH = 1.5
 """How much finer the grid of a level becomes when its certificate misses the tolerance: 1.5^4 ≈ 5 in error."""
@@ -58,8 +58,16 @@ class LevelPlan:
 
     @property
     def pairs(self) -> int:
-        """Lobe evaluations of the convolution."""
-        return self.outputs * 6 * self.grid**2
+        """Lobe evaluations of the convolution, those it may skip included in proportion to the near cap."""
+        return pairs_of(self.outputs, self.grid, max(self.roughness**2, 1e-5))
+
+
+def pairs_of(outputs: int, grid: int, alpha: float) -> int:
+    """Lobe evaluations of `outputs` directions over a grid, as its split leaves them."""
+    split = split_for(grid, alpha)
+    if split is None:
+        return outputs * 6 * grid**2
+    return int(outputs * 6 * (grid**2 * split.s1 / 2 + split.grid**2))
 
 
 def grid_size(alpha: float, tolerance: float) -> int:
@@ -69,27 +77,65 @@ def grid_size(alpha: float, tolerance: float) -> int:
     return min(max(8 * math.ceil(n / 8), 8), LARGEST_GRID)
 
 
-def cuts_for(texel: float, alpha: float, tolerance: float) -> int:
+KINK_ERROR = 0.021
+"""Error of midpoints over texels of 1 radian across the kink of (n·l)₊, on the hardest image measured."""
+
+
+def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0) -> int:
     """Quadrature nodes a texel edge so that integrating a lobe over a texel of angle `texel` errs < tolerance/10.
 
     Midpoints (1) leave 1.3e-3·(texel/α/.34)² (measured: 1.3e-3 at .34); pairs of Gauss points in m cells an
-    edge leave about 1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this bounds by its fourth power.
+    edge leave about 1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this bounds by its fourth power. The
+    kink of (n·l)₊ costs a texel with `share` of all energy share·texel/(8 cuts²) where it sets, and midpoints
+    KINK_ERROR·texel on a whole image, which a certificate with midpoints adds to its statement.
     """
     x = texel / alpha / 0.34
-    if 1.3e-3 * x * x <= tolerance / 20:
+    kink = math.sqrt(2.5 * share * texel / tolerance)
+    if 1.3e-3 * x * x <= tolerance / 20 and kink <= 1 and KINK_ERROR * texel <= tolerance / 7:
         return 1
-    cells = x * (5e-4 / tolerance) ** 0.25
+    cells = max(x * (5e-4 / tolerance) ** 0.25, kink / 2)
     return 2 * min(max(1, math.ceil(cells)), 512)
 
 
-def plan_chain(chain: Chain, texel: float) -> tuple[LevelPlan, ...]:
-    """The levels of a chain for a source whose texels subtend `texel` radians."""
+@dataclass(frozen=True)
+class Split:
+    """A lobe in two parts: within the chord √(2 s1) over the fine grid, beyond s0 over `grid` nodes an edge."""
+
+    s0: float
+    s1: float
+    grid: int
+
+
+NEAR_ANGLE, FAR_NODES = 0.6, 28.0
+"""Where the near part of a lobe of 192 nodes ends, radians, and nodes × that angle of the far grid, for 1e-3:
+measured to leave the error as it is at a quarter of the time."""
+
+
+def split_for(n: int, alpha: float) -> Split | None:
+    """How to part the work over an n × n grid, or None where the far part would cost as much as the whole.
+
+    Near pairs grow with θ1², far ones with 1/θ1² since the far part is smooth on the scale θ1; the far grid
+    must also carry the lobe's kink at the horizon. A finer n, for a tighter tolerance, refines both alike.
+    """
+    sharp = SHARP / alpha + MARGIN
+    theta = NEAR_ANGLE * math.sqrt(192 / sharp)
+    if theta > 1.0:
+        return None
+    far = n / sharp * max(FAR_NODES / theta, FLOOR + KINK * alpha)
+    far = 8 * math.ceil(far / 8)
+    s1 = 1 - math.cos(theta)
+    return Split(s1 / 16, s1, far) if far <= n / 2 else None
+
+
+def plan_chain(chain: Chain, texel: float, share: float = 0.0) -> tuple[LevelPlan, ...]:
+    """The levels of a chain for a source whose texels subtend `texel` radians and hold at most `share` of its
+    energy each, bright ones apart."""
     levels = []
     for size, r in chain.levels:
         parameters = chain.parameters(r)
         alpha = max(r * r, 1e-5)
         levels.append(LevelPlan(size, r, parameters, 0 if r == 0 else grid_size(alpha, chain.tolerance),
-                                1 if r == 0 else cuts_for(texel, alpha, chain.tolerance)))
+                                1 if r == 0 else cuts_for(texel, alpha, chain.tolerance, share)))
     return tuple(levels)
 
 

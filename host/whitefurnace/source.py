@@ -64,7 +64,11 @@ def _bindings(slots: Mapping[str, Model]) -> str:
             target = f"{slot}_{entry.name}_{ending}"
             if carries is None:  # a self-contained model names its parameters in its own signature
                 values = ", ".join(dummies + names)
-                lines.append(f"#define {function}{'(' + ', '.join(dummies) + ')' if count else ''} {target}({values})")
+                bound = function
+                if function == "NDF_D":  # D is 0 for backfacing m, whatever the model: said here, once for all
+                    bound = "NDF_D_FRONT"
+                    lines.append("#define NDF_D(a0, a1) ((a0) > 0 ? NDF_D_FRONT(a0, a1) : (real)0)")
+                lines.append(f"#define {bound}{'(' + ', '.join(dummies) + ')' if count else ''} {target}({values})")
             else:
                 lines.append(f"#define {function}({', '.join(dummies)}) {target}({', '.join(dummies)}{carries})")
     names = [n for slot in slots for n in own[slot]]

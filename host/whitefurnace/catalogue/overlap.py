@@ -207,7 +207,10 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
         leave = np.where(hits[1 - enter_x, n] < hits[5 - enter_z, n], 1 - enter_x, 5 - enter_z)
         pole = on & ~(hits[enter, n] > 0)
         inverse_in, inverse_out = 1 / lines[enter, n], 1 / lines[leave, n]
-    inverse_in = np.where(pole, 0.0, inverse_in)
+    # A breakpoint rounded past an axis leaves a piece of 1e-16 rad where no side is left: no weight.
+    lost = on & ~np.isfinite(inverse_out)
+    width = np.where(lost, 0.0, width)
+    inverse_in, inverse_out = np.where(pole | lost, 0.0, inverse_in), np.where(lost, 1.0, inverse_out)
     p_up = np.where(on, np.where(enter < 2, inverse_in, 0.0), -t0[own])
     q_up = np.where(on & (enter >= 2), inverse_in, 0.0)
     p_down = np.where(on, np.where(leave < 2, inverse_out, 0.0), -t1[own])
@@ -273,3 +276,257 @@ def _between(texels: npt.NDArray[np.float32], top: int, bottom: int, step: Float
         c = which[here] - begin
         total += width[here] @ (prefix[last[here], c] - prefix[first[here], c])
     return total
+
+
+# ---------------------------------------------------------------------------------------------- cube source
+
+# A side of a region in the plane of a source face is t(s) = a + b s + k √(e + g s²): a great circle (k = 0), a
+# parallel on a side face (e = g = 1) or on ±Y (a circle, e = ρ², g = -1).
+_NONE_BELOW = np.array([-1.0, 0.0, 0.0, 1.0, 0.0])
+_NONE_ABOVE = np.array([1.0, 0.0, 0.0, 1.0, 0.0])
+
+
+def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Floats, below: Floats, above: Floats,
+             extra: Floats) -> tuple[Floats, Floats]:
+    """∫∫ L (1 + s² + t²)^{-3/2} dt ds over regions of face planes: (R, 3), and with L = 1: (R,).
+
+    texels: (6 n², 3). place: (R, 3), the flat index of texel (s, t) = (0, 0) of a region's face and the steps to
+    the next along s and t. low, high: (R,), the range of s in [-1, 1], empty ones too. below, above: (R, K, 5),
+    the region lies over the highest of the one and under the lowest of the other. extra: (R, E), places in s
+    where two sides meet. The antiderivative of the density in t is t/((1 + s²) √(1 + s² + t²)).
+    """
+    count, n = len(place), math.isqrt(len(texels) // 6)
+    keep = np.flatnonzero(high > low)
+    owners: list[Ints] = []
+    points: list[Floats] = []
+    k, c = _ranges(np.ceil((low[keep] + 1) / 2 * n).astype(np.int64),
+                   np.floor((high[keep] + 1) / 2 * n).astype(np.int64) + 1)
+    owners.append(keep[k])
+    points.append((2 * c - n) / n)
+    owners.append(np.repeat(keep, extra.shape[1]))
+    points.append(extra[keep].ravel())
+    for sides in (below, above):
+        for side in np.moveaxis(sides, 1, 0):
+            a, b, bend, e, g = side[keep].T
+            # The rows a side can cross lie between its values at the ends and at its apex s = 0.
+            ends = np.stack([low[keep], high[keep], np.clip(0, low[keep], high[keep])])
+            t = np.clip(a + b * ends + bend * np.sqrt(np.maximum(e + g * ends * ends, 0)), -1, 1)
+            first = np.ceil((t.min(0) + 1) / 2 * n - 1e-9).astype(np.int64)
+            last = np.floor((t.max(0) + 1) / 2 * n + 1e-9).astype(np.int64) + 1
+            k, r = _ranges(np.maximum(first, 0), np.minimum(last, n + 1))
+            t = (2 * r - n) / n
+            with np.errstate(divide="ignore", invalid="ignore"):
+                line = (t - a[k]) / b[k]
+                bent = np.sqrt(((t / bend[k]) ** 2 - e[k]) / g[k])
+            straight = bend[k] == 0
+            for s in (np.where(straight, line, bent), np.where(straight, np.nan, -bent)):
+                owners.append(keep[k])
+                points.append(s)
+    own, s0, s1 = _intervals(owners, points, low, high)
+    width, middle = s1 - s0, (s0 + s1) / 2
+
+    def value(side: Floats, s: Floats) -> Floats:
+        a, b, bend, e, g = side.T
+        return a + b * s + bend * np.sqrt(np.maximum(e + g * s * s, 0))
+
+    def highest(sides: Floats, sign: int) -> tuple[Floats, Floats]:
+        """The side (intervals, 5) that bounds each interval, and its t in the middle."""
+        best = np.where(sign > 0, _NONE_BELOW, _NONE_ABOVE) * np.ones((len(own), 1))
+        t = np.full(len(own), -1.0 * sign)
+        for side in np.moveaxis(sides, 1, 0):
+            here = value(side[own], middle)
+            over = (here - t) * sign > 0
+            best[over], t = side[own][over], np.where(over, here, t)
+        return best, t
+
+    under, t0 = highest(below, 1)
+    over, t1 = highest(above, -1)
+    real = t1 > t0
+    own, s0, s1, width, middle, under, over, t0, t1 = (
+        x[real] for x in (own, s0, s1, width, middle, under, over, t0, t1))
+    r0 = np.clip(np.floor((t0 + 1) / 2 * n).astype(np.int64), 0, n - 1)
+    r1 = np.maximum(np.clip(np.floor((t1 + 1) / 2 * n).astype(np.int64), 0, n - 1), r0)
+    column = np.clip(np.floor((middle + 1) / 2 * n).astype(np.int64), 0, n - 1)
+    single = r0 == r1
+    after, before = 2 * (r0 + 1) / n - 1, 2 * r1 / n - 1
+
+    # The nearest singularity is s = ±i, or for a circle its end, .3 of its radius away: 14 nodes leave 1e-13 on
+    # the largest piece of a face cut in two, 28 where it is whole, 6 where columns cut lines into sixteenths.
+    first, last = np.zeros(len(own)), np.zeros(len(own))
+    x, w = gauss(28 if n == 1 else 14 if n < 16 or (below[..., 4] < 0).any() else 6)
+    for xk, wk in zip(x, w, strict=True):
+        s = s0 + width * xk
+        q = 1 + s * s
+        lower, upper = (np.clip(value(side, s), -1, 1) for side in (under, over))
+        low_f, high_f, after_f, before_f = (t / (q * np.sqrt(q + t * t)) for t in (lower, upper, after, before))
+        first += wk * np.where(single, high_f - low_f, after_f - low_f)
+        last += wk * np.where(single, 0.0, high_f - before_f)
+    first *= width
+    last *= width
+    origin = place[own, 0] + column * place[own, 1]
+    step = place[own, 2]
+    sums = _sum_by(own, first[:, None] * texels[origin + r0 * step] + last[:, None] * texels[origin + r1 * step],
+                   count)
+    area = np.bincount(own, first + last, count)
+
+    # Texels wholly between the two sides, by Gauss nodes too: exact where the piece spans the column.
+    k, r = _ranges(r0 + 1, r1)
+    if len(k):
+        a, b = 2 * r / n - 1, 2 * (r + 1) / n - 1
+        weight = np.zeros(len(k))
+        x, w = gauss(8 if n < 16 else 4)
+        for xk, wk in zip(x, w, strict=True):
+            q = 1 + (s0 + width * xk) ** 2
+            q, inverse = q[k], (wk * width / q)[k]
+            weight += inverse * (b / np.sqrt(q + b * b) - a / np.sqrt(q + a * a))
+        sums += _sum_by(own[k], weight[:, None] * texels[origin[k] + r * step[k]], count)
+        area += np.bincount(own[k], weight, count)
+    return sums, area
+
+
+def _to_face(face: int, d: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats, Floats]:
+    """(s, t, axis) components of d in the frame of a face of the GL-direct layout."""
+    x, y, z = d
+    return ((-z, -y, x), (z, -y, -x), (x, z, y), (x, -z, -y), (x, -y, z), (-x, -y, -z))[face]
+
+
+def _places(n: int, face: Ints) -> Ints:
+    return np.stack([face * n * n, np.full_like(face, 1), np.full_like(face, n)], 1)
+
+
+def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
+                    flat: Ints) -> tuple[Floats, Floats]:
+    """Texel and solid angle of each, from the six source faces: in their planes a texel is the polygon that its
+    four side planes n·d ≥ 0 cut out."""
+    n, m = texels.shape[1], len(flat)
+    face, rest = np.divmod(flat, size * size)
+    i, j = np.divmod(rest, size)
+    s0, s1, t0, t1 = ((2 * k - size) / size for k in (j, j + 1, i, i + 1))
+    one, zero = np.ones(m), np.zeros(m)
+    planes = np.empty((4, 3, m))
+    for k, (s, t, axis) in enumerate(((one, zero, -s0), (-one, zero, s1), (zero, one, -t0), (zero, -one, t1))):
+        for f in range(6):
+            # The frame's axes as world vectors: s, t and axis of a face, the transpose of `_to_face`.
+            world = _frame(f)
+            here = face == f
+            for c in range(3):
+                planes[k, c, here] = (world[0][c] * s + world[1][c] * t + world[2][c] * axis)[here]
+    cosine, sine = math.cos(rotation), math.sin(rotation)
+    planes = np.stack([cosine * planes[:, 0] + sine * planes[:, 2], planes[:, 1],
+                       cosine * planes[:, 2] - sine * planes[:, 0]], 1)
+    low, high = np.full((6, m), -1.0), np.full((6, m), 1.0)
+    below, above = np.tile(_NONE_BELOW, (6, m, 4, 1)), np.tile(_NONE_ABOVE, (6, m, 4, 1))
+    lines = np.empty((6, 6, 3, m))
+    lines[:, 4], lines[:, 5] = np.array([0, 1, 1])[:, None], np.array([0, -1, 1])[:, None]
+    for f in range(6):
+        for k in range(4):
+            ns, nt, na = (np.asarray(v) for v in _to_face(f, tuple(planes[k])))  # type: ignore[arg-type]
+            lines[f, k] = ns, nt, na
+            with np.errstate(divide="ignore", invalid="ignore"):
+                # A plane within 1e-15 of the t axis bounds s: its t(s) would be lost in rounding.
+                upright = np.abs(nt) < 1e-15
+                bound = -na / ns
+                low[f] = np.where(upright & (ns > 0), np.maximum(low[f], bound), low[f])
+                high[f] = np.where(upright & (ns < 0), np.minimum(high[f], bound), high[f])
+                side = np.stack([-na / nt, -ns / nt, np.zeros(m), np.ones(m), np.zeros(m)], 1)
+            # A plane through the centre line of the face that keeps all or nothing of it.
+            high[f] = np.where(upright & (ns == 0) & (na < 0), -2.0, high[f])
+            below[f, ~upright & (nt > 0), k] = side[~upright & (nt > 0)]
+            above[f, ~upright & (nt < 0), k] = side[~upright & (nt < 0)]
+    meet = []
+    for a in range(6):
+        for b in range(a):
+            p, q = lines[:, a], lines[:, b]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                meet.append((p[:, 1] * q[:, 2] - p[:, 2] * q[:, 1]) / (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]))
+    extra = np.stack(meet, -1).reshape(6 * m, -1)
+    sums, area = _regions(texels.reshape(-1, 3), _places(n, np.repeat(np.arange(6), m)),
+                          low.ravel(), high.ravel(), below.reshape(6 * m, 4, 5), above.reshape(6 * m, 4, 5), extra)
+    return sums.reshape(6, m, 3).sum(0), area.reshape(6, m).sum(0)
+
+
+def _frame(face: int) -> tuple[tuple[float, float, float], ...]:
+    """World vectors of a face's s, t and axis."""
+    basis = [_to_face(face, (np.float64(x), np.float64(y), np.float64(z)))  # type: ignore[arg-type]
+             for x, y, z in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    return tuple((float(basis[0][k]), float(basis[1][k]), float(basis[2][k])) for k in range(3))
+
+
+def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
+                       flat: Ints) -> tuple[Floats, Floats]:
+    """Each texel and its solid angle, over the source faces.
+
+    On a side face s = -tan ψ, so meridians bound s and a parallel is t = -cot θ √(1 + s²). On ±Y a texel is a
+    piece of a ring: cut into octants, with the distance p from the octant's axis as s and the one along it as
+    t, it lies between the circles √(ρ² - p²) and the rays t = p cot φ, all analytic.
+    """
+    n, m = texels.shape[1], len(flat)
+    i, j = np.divmod(flat, 2 * size)
+    phi0, phi1 = ((k * math.pi / size) - math.pi - rotation for k in (j, j + 1))
+    cotangent = np.array([np.inf, *(1 / np.tan(np.arange(1, size) * math.pi / size)), -np.inf])
+    if size % 2 == 0:
+        cotangent[size // 2] = 0.0
+    cot0, cot1 = cotangent[i], cotangent[i + 1]
+    quarter = math.pi / 4
+    place, low, high, below, above, extra = [], [], [], [], [], []
+
+    def add(where: Ints, s0: Floats, s1: Floats, under: list[Floats], over: list[Floats],
+            meet: list[Floats]) -> None:
+        place.append(np.broadcast_to(where, (m, 3)))
+        low.append(s0)
+        high.append(s1)
+        below.append(np.stack([np.stack(np.broadcast_arrays(*side), -1) for side in under], 1))
+        above.append(np.stack([np.stack(np.broadcast_arrays(*side), -1) for side in over], 1))
+        extra.append(np.stack(meet, 1))
+
+    zero, one = np.zeros(m), np.ones(m)
+    nothing = np.full(m, np.nan)
+    for face, axis in ((0, 0.0), (1, math.pi), (4, math.pi / 2), (5, -math.pi / 2)):
+        # A texel spans up to 2π (size 1 is π): it may reach the face from both sides, in separate pieces.
+        for turn in range(-2, 3):
+            a = np.clip(phi0 - axis + 2 * math.pi * turn, -quarter, quarter)
+            b = np.clip(phi1 - axis + 2 * math.pi * turn, -quarter, quarter)
+            top, bottom = np.clip(-cot0, -4, 4), np.clip(-cot1, -4, 4)
+            add(_places(n, np.array([face]))[0], np.where(b == quarter, -1.0, -np.tan(b)),
+                np.where(a == -quarter, 1.0, -np.tan(a)),
+                [(zero, zero, top, one, one)], [(zero, zero, bottom, one, one)], [nothing])  # type: ignore[list-item]
+    for south in (False, True):
+        near, far = (-cot1, -cot0) if south else (cot0, cot1)  # |cot θ| grows towards the pole
+        with np.errstate(divide="ignore"):
+            inner, outer = np.where(near > 0, 1 / near, np.inf), np.where(far > 0, 1 / far, 4.0)
+        inner, outer = np.minimum(inner, 4.0), np.minimum(outer, 4.0)
+        for octant in range(8):
+            # Axis along ±x or ±z, azimuth from it growing (towards larger φ) or falling.
+            quadrant, mirrored = octant // 2, octant % 2
+            centre = quadrant * math.pi / 2
+            # The direction of the axis and of growing p as steps in (x, z), then in (s, t) of the face.
+            ax, az = ((1, 0), (0, 1), (-1, 0), (0, -1))[quadrant]
+            px, pz = ((0, 1), (-1, 0), (0, -1), (1, 0))[quadrant]
+            if mirrored:
+                px, pz = -px, -pz
+            flip = -1 if south else 1  # t = ±z
+            step_t, step_s = ax + n * flip * az, px + n * flip * pz
+            origin = (3 if south else 2) * n * n
+            origin += sum(-k * (n - 1) for k in (step_t, step_s) if k < 0)
+            for turn in range(-2, 3):
+                a, b = phi0 - centre + 2 * math.pi * turn, phi1 - centre + 2 * math.pi * turn
+                a, b = (-b, -a) if mirrored else (a, b)
+                a, b = np.clip(a, 0, quarter), np.clip(b, 0, quarter)
+                live = (b > a) & (outer > inner)
+                ray_a = np.where(a > 0, 1 / np.tan(np.where(a > 0, a, 1)), 1e300)
+                ray_b = np.where(b > 0, 1 / np.tan(np.where(b > 0, b, 1)), 1e300)
+                ray_b = np.where(b == quarter, 1.0, ray_b)
+                top_p = np.where(live, np.minimum(outer * np.sin(b), 1.0), -1.0)
+                meet = [rho * np.sin(angle) for rho in (inner, outer) for angle in (a, b)]
+                meet += [np.tan(a), np.tan(b)]
+                add(np.array([origin, step_s, step_t]), np.where(live, inner * np.sin(a), 0.0), top_p,
+                    [(zero, zero, one, inner**2, -one), (zero, ray_b, zero, one, zero)],  # type: ignore[list-item]
+                    [(zero, zero, one, outer**2, -one),  # type: ignore[list-item]
+                     (np.where(a > 0, 0.0, 1e300), np.where(a > 0, ray_a, 0.0), zero, one, zero)], meet)
+    # Side faces have one side each way: padded with a copy to two, as on ±Y.
+    both = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in below]
+    over = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in above]
+    meets = [np.pad(x, ((0, 0), (0, 6 - x.shape[1])), constant_values=np.nan) for x in extra]
+    sums, area = _regions(texels.reshape(-1, 3), np.concatenate(place), np.concatenate(low),
+                          np.concatenate(high), np.concatenate(both), np.concatenate(over), np.concatenate(meets))
+    return sums.reshape(-1, m, 3).sum(0), area.reshape(-1, m).sum(0)
