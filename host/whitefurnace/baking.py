@@ -6,7 +6,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -168,7 +168,7 @@ def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_
     manifest = _manifest(env, recipe, key, on, lit, table)
     with Transaction() as transaction:
         digests = {}
-        provenance = {"whitefurnace": VERSION, "key": key, "source": env.digest,
+        provenance = {"version": VERSION, "key": key, "source": env.digest,
                       "recipe": json.dumps(recipe, sort_keys=True)}
         for target in _targets(request, name, lit, table, provenance):
             assert target.write is not None
@@ -304,7 +304,7 @@ def _exr(request: Order, engine: Engine, name: str, lit: Lighting | None, table:
     targets: list[Target] = []
 
     def add(ending: str, shape: tuple[int, int], texels: np.ndarray | None, alpha: np.ndarray | None = None,
-            channels: str = "RGB", **attributes: Any) -> None:
+            channels: str = "RGB", attributes: Mapping[str, str | float] | None = None) -> None:
         path = request.output / engine.name / f"{name}_{ending}.exr"
         nbytes = 4 * shape[0] * shape[1] * len(channels)
         if texels is None:
@@ -314,26 +314,31 @@ def _exr(request: Order, engine: Engine, name: str, lit: Lighting | None, table:
         names = channels
         if alpha is not None:
             pixels, names = np.concatenate([pixels, alpha.reshape(*shape, 1)], -1), "RGBA"
-        told = {f"whitefurnace:{key}" if key != "whitefurnace" else "whitefurnace:version": value
-                for key, value in provenance.items()}
-        told |= {f"whitefurnace:{key}": value for key, value in attributes.items()}
+        told = {f"whitefurnace:{key}": value for key, value in {**provenance, **(attributes or {})}.items()}
         targets.append(Target(path, engine.name, nbytes, lambda t: write_exr(
             path, pixels, channel_names=tuple(names), attributes=told, into=t)))
 
     for k, (size, _) in enumerate(request.recipe.levels):
-        for ending, shape, levels, coverage in (
-            (f"specular_{k}", (6 * size, size), lit and lit.levels, lit and lit.coverage),
-            (f"specular_{k}_latlong", (2 * size, 4 * size), lit and lit.latlongs, lit and lit.latlong_coverage),
+        cube, wide = (6 * size, size), (2 * size, 4 * size)
+        if lit is None:
+            add(f"specular_{k}", cube, None)
+            add(f"specular_{k}_latlong", wide, None)
+            continue
+        for ending, shape, level, coverage in (
+            (f"specular_{k}", cube, lit.levels[k], lit.coverage),
+            (f"specular_{k}_latlong", wide, lit.latlongs[k], lit.latlong_coverage),
         ):
-            level = levels[k] if levels else None
-            told = {} if level is None else {"roughness": level.roughness, "error": level.error,
-                                             "worst": level.worst, "rmse": level.rmse, "method": level.method}
-            add(ending, shape, None if level is None else level.texels, coverage[k] if coverage else None, **told)
-    e = lit and lit.irradiance
-    sh = {} if lit is None or e is None else {"error": e.error, "sh": json.dumps(lit.sh.tolist())}
-    add("irradiance", (6 * IRRADIANCE_SIZE, IRRADIANCE_SIZE), e.texels if e else None, **sh)
-    add("dfg", (DFG_SIZE, DFG_SIZE), None if table is None else table.values, channels="RG",
-        **({} if table is None else {"error": table.error, "rule": table.rule}))
+            add(ending, shape, level.texels, coverage[k] if coverage else None, attributes={
+                "roughness": level.roughness, "error": level.error, "worst": level.worst, "rmse": level.rmse,
+                "method": level.method})
+    irradiance = (6 * IRRADIANCE_SIZE, IRRADIANCE_SIZE)
+    if lit is None or table is None:
+        add("irradiance", irradiance, None)
+        add("dfg", (DFG_SIZE, DFG_SIZE), None, channels="RG")
+        return targets
+    add("irradiance", irradiance, lit.irradiance.texels, attributes={
+        "error": lit.irradiance.error, "sh": json.dumps(lit.sh.tolist())})
+    add("dfg", (DFG_SIZE, DFG_SIZE), table.values, channels="RG", attributes={"error": table.error, "rule": table.rule})
     return targets
 
 

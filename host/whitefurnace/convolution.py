@@ -3,6 +3,7 @@ integral, and refines what misses its tolerance."""
 from __future__ import annotations
 
 import hashlib
+import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -126,7 +127,7 @@ def lobe_norm(ndf: Model, parameters: dict[str, float]) -> float:
     edges = np.concatenate([[0.0], np.geomspace(1e-14, 1.0, 57)])
     x, w = gauss(12)
     total = 0.0
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in itertools.pairwise(edges):
         s = a + (b - a) * x
         total += float((w * (b - a) * ndf.reference["D"](np.sqrt(1 - s / 2), **parameters) * (1 - s)).sum())
     return 2 * math.pi * total
@@ -331,7 +332,8 @@ class Convolver:
             if split and far and blocks:
                 window = np.float32(split.s0), np.float32(split.s1)
                 groups = self.device.array(_bounds(part, group).astype(np.float32))
-                splits = self._partials(lobe, listed, count, block, partial, 0, "convolve_near", *window, groups, blocks)
+                splits = self._partials(lobe, listed, count, block, partial, 0, "convolve_near", *window, groups,
+                                        blocks)
                 splits += self._partials(lobe, far, far.shape[0], block, partial, splits, "convolve_far", *window)
             else:
                 splits = self._partials(lobe, listed, count, block, partial, 0)
@@ -362,18 +364,18 @@ class Convolver:
         coefficients = np.zeros(28)
         for listed, count, _share in self._bands(cuts):
             coefficients += self._harmonic_sums(listed, count)
-            for lobe, block, sums in jobs:
-                sums += self._list_sums(lobe, listed, count, block)
+            for lobe, directions_on, sums in jobs:
+                sums += self._list_sums(lobe, listed, count, directions_on)
         results = []
         fine = 2 * max((self._bright_cuts(lobe, tolerance) for lobe, _ in wanted), default=2)
         bright = self._bright_list(fine)
         if bright is not None:
             extra = self._harmonic_sums(bright, bright.shape[0])
             coefficients[:27] += extra[:27]
-        for (_, directions), (lobe, block, sums) in zip(wanted, jobs, strict=True):
+        for (_, directions), (lobe, directions_on, sums) in zip(wanted, jobs, strict=True):
             value = sums[:3] / sums[3]
             if bright is not None:
-                value += self._list_sums(lobe, bright, bright.shape[0], block)[:3] / lobe.norm
+                value += self._list_sums(lobe, bright, bright.shape[0], directions_on)[:3] / lobe.norm
             results.append(value.T[:directions.shape[1]])
         self._harmonics[cuts] = coefficients
         return results
@@ -506,7 +508,8 @@ class Convolver:
     def _texel_centres(self, index: np.ndarray) -> np.ndarray:
         """(m, 3) directions of source texels by flat index."""
         e = self.environment
-        d = (_latlong_centres(self.rows, self.columns, index) if self.latlong else _cube_directions(self.rows)[:, index])
+        d = (_latlong_centres(self.rows, self.columns, index) if self.latlong
+             else _cube_directions(self.rows)[:, index])
         c, s = math.cos(e.rotation), math.sin(e.rotation)
         return np.stack([c * d[0] - s * d[2], d[1], s * d[0] + c * d[2]], 1)
 

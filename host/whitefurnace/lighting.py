@@ -95,8 +95,8 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) ->
 
 def irradiance_job(convolver: Convolver, size: int, tolerance: float) -> Job:
     """The job of the irradiance cube."""
-    return Job(LevelPlan(size, 1.0, {}, planning.grid_size(1.0, tolerance),
-                         planning.cuts_for(convolver.texel, 1.0, tolerance, convolver.share)), COSINE, Shape(False, size))
+    cuts = planning.cuts_for(convolver.texel, 1.0, tolerance, convolver.share)
+    return Job(LevelPlan(size, 1.0, {}, planning.grid_size(1.0, tolerance), cuts), COSINE, Shape(False, size))
 
 
 def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> list[Level]:
@@ -108,7 +108,8 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
     grids = [(job.plan.grid, job.lobe.alpha) for job in jobs if job.lobe]
     if grids:
         convolver.prepare(*max(grids))
-    work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0) for job in jobs]
+    work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0)
+            for job in jobs]
     done = 0
     texels, seconds = [], []
     for job, cost in zip(jobs, work, strict=True):
@@ -126,8 +127,8 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
         while level.error > tolerance:
             finer = planning.refined(job.plan) if job.lobe else None
             if finer is None:
-                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g} on its "
-                                 f"finest grid, over the tolerance {tolerance:g}")
+                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g} on "
+                                 f"its finest grid, over the tolerance {tolerance:g}")
             job = replace(job, plan=finer)
             begin = time.perf_counter()
             again = _make(convolver, job, tolerance, (0.8, 0.8))
@@ -161,19 +162,19 @@ def _references(convolver: Convolver, jobs: Sequence[Job],
 
 def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np.ndarray, np.ndarray],
             reference: np.ndarray, seconds: float) -> Level:
-    uniform, near = sample
     index = np.concatenate(sample)
     solid = job.shape.solid_angles()
     flat = texels.reshape(-1, 3)
     mean = float((flat * solid[:, None]).sum() / (3 * solid.sum()))
-    error, worst, rmse = statement(flat[index], reference, len(uniform), solid[index], mean, job.shape.count)
+    error, worst, rmse = statement(flat[index], reference, len(sample[0]), solid[index], mean, job.shape.count)
     rounding = ROUNDING if mean > 0 else 0.0
     if mean > 0 and job.lobe is not None and job.plan.cuts == 1 and not convolver.constant:
         rounding += planning.KINK_ERROR * convolver.texel  # what the reference itself may be off by
     if job.lobe is None:
         method, pairs = "texel-mean", 0
     else:
-        method, pairs = f"anterpolated-{job.plan.grid}", planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha)
+        method = f"anterpolated-{job.plan.grid}"
+        pairs = planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha)
     scaled = (texels.astype(np.float64) / convolver.scale).astype(np.float32)
     return Level(scaled, job.plan.roughness, error + rounding, worst + rounding, rmse, method, job.plan.grid, pairs,
                  seconds)

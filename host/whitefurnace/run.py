@@ -200,8 +200,9 @@ def dfg(size: int = 128, *, ndf: str | Model = "ggx", masking: str | Model = "sm
     rows = [{**choice.model.from_roughness(float(r)), **choice.given} for r in axis]
     columns = {name: np.array([row[name] for row in rows])[:, None] for name in rows[0]}
     columns = {name: np.clip(v, _low(choice.model, name), None) for name, v in columns.items()}
+    parameters: dict[str, Any] = {"NoV": axis[None, :], **columns}
     result = integrate("dfg", ndf=choice.model, masking=masking, tolerance=tolerance, precision=precision,
-                       device=device, NoV=axis[None, :], **columns)
+                       device=device, **parameters)
     return Integrated(np.ascontiguousarray(result.values, np.float32), result.error, result.evaluations,
                       result.seconds, result.rule)
 

@@ -245,7 +245,7 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
 
     sums = _sum_by(own, first_weight[:, None] * radiance(r_up, column, flip)
                    + last_weight[:, None] * radiance(r_down, column, flip), m)
-    area = np.bincount(own, width * (v_down - v_up), m)
+    area = np.bincount(own, width * (v_down - v_up), m).astype(np.float64)
 
     # Rows wholly between the two sides.
     tall = (r_last - r_first > TALL)[own]
@@ -342,8 +342,8 @@ def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Fl
     under, t0 = highest(below, 1)
     over, t1 = highest(above, -1)
     real = t1 > t0
-    own, s0, s1, width, middle, under, over, t0, t1 = (
-        x[real] for x in (own, s0, s1, width, middle, under, over, t0, t1))
+    own, under, over = own[real], under[real], over[real]
+    s0, width, middle, t0, t1 = (x[real] for x in (s0, width, middle, t0, t1))
     r0 = np.clip(np.floor((t0 + 1) / 2 * n).astype(np.int64), 0, n - 1)
     r1 = np.maximum(np.clip(np.floor((t1 + 1) / 2 * n).astype(np.int64), 0, n - 1), r0)
     column = np.clip(np.floor((middle + 1) / 2 * n).astype(np.int64), 0, n - 1)
@@ -367,7 +367,7 @@ def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Fl
     step = place[own, 2]
     sums = _sum_by(own, first[:, None] * texels[origin + r0 * step] + last[:, None] * texels[origin + r1 * step],
                    count)
-    area = np.bincount(own, first + last, count)
+    area = np.bincount(own, first + last, count).astype(np.float64)
 
     # Texels wholly between the two sides, by Gauss nodes too: exact where the piece spans the column.
     k, r = _ranges(r0 + 1, r1)
@@ -416,8 +416,8 @@ def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
                        cosine * planes[:, 2] - sine * planes[:, 0]], 1)
     low, high = np.full((6, m), -1.0), np.full((6, m), 1.0)
     below, above = np.tile(_NONE_BELOW, (6, m, 4, 1)), np.tile(_NONE_ABOVE, (6, m, 4, 1))
-    lines = np.empty((6, 6, 3, m))
-    lines[:, 4], lines[:, 5] = np.array([0, 1, 1])[:, None], np.array([0, -1, 1])[:, None]
+    lines = np.empty((6, 8, 3, m))  # the texel's sides and the face's, (a, b, c) of a s + b t + c >= 0
+    lines[:, 4:] = np.array([(0, 1, 1), (0, -1, 1), (1, 0, 1), (-1, 0, 1)])[:, :, None]
     for f in range(6):
         for k in range(4):
             ns, nt, na = (np.asarray(v) for v in _to_face(f, tuple(planes[k])))  # type: ignore[arg-type]
@@ -433,13 +433,20 @@ def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
             high[f] = np.where(upright & (ns == 0) & (na < 0), -2.0, high[f])
             below[f, ~upright & (nt > 0), k] = side[~upright & (nt > 0)]
             above[f, ~upright & (nt < 0), k] = side[~upright & (nt < 0)]
+    # Corners where two lines meet within all the others: they bound s and cut it.
     meet = []
-    for a in range(6):
+    for a in range(8):
         for b in range(a):
             p, q = lines[:, a], lines[:, b]
+            corner = np.cross(p, q, axis=1)
             with np.errstate(divide="ignore", invalid="ignore"):
-                meet.append((p[:, 1] * q[:, 2] - p[:, 2] * q[:, 1]) / (p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]))
-    extra = np.stack(meet, -1).reshape(6 * m, -1)
+                s, t = corner[:, 0] / corner[:, 2], corner[:, 1] / corner[:, 2]
+                inside = (lines[:, :, 0] * s[:, None] + lines[:, :, 1] * t[:, None] + lines[:, :, 2] > -1e-9).all(1)
+            meet.append(np.where(inside, s, np.nan))
+    extra = np.stack(meet, -1)
+    low = np.maximum(low, np.where(np.isnan(extra), 2.0, extra).min(-1))
+    high = np.minimum(high, np.where(np.isnan(extra), -2.0, extra).max(-1))
+    extra = extra.reshape(6 * m, -1)
     sums, area = _regions(texels.reshape(-1, 3), _places(n, np.repeat(np.arange(6), m)),
                           low.ravel(), high.ravel(), below.reshape(6 * m, 4, 5), above.reshape(6 * m, 4, 5), extra)
     return sums.reshape(6, m, 3).sum(0), area.reshape(6, m).sum(0)
@@ -470,8 +477,8 @@ def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: i
     quarter = math.pi / 4
     place, low, high, below, above, extra = [], [], [], [], [], []
 
-    def add(where: Ints, s0: Floats, s1: Floats, under: list[Floats], over: list[Floats],
-            meet: list[Floats]) -> None:
+    def add(where: Ints, s0: Floats, s1: Floats, under: list[tuple[Floats, ...]],
+            over: list[tuple[Floats, ...]], meet: list[Floats]) -> None:
         place.append(np.broadcast_to(where, (m, 3)))
         low.append(s0)
         high.append(s1)
@@ -489,7 +496,7 @@ def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: i
             top, bottom = np.clip(-cot0, -4, 4), np.clip(-cot1, -4, 4)
             add(_places(n, np.array([face]))[0], np.where(b == quarter, -1.0, -np.tan(b)),
                 np.where(a == -quarter, 1.0, -np.tan(a)),
-                [(zero, zero, top, one, one)], [(zero, zero, bottom, one, one)], [nothing])  # type: ignore[list-item]
+                [(zero, zero, top, one, one)], [(zero, zero, bottom, one, one)], [nothing])
     for south in (False, True):
         near, far = (-cot1, -cot0) if south else (cot0, cot1)  # |cot θ| grows towards the pole
         with np.errstate(divide="ignore"):
@@ -520,8 +527,8 @@ def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: i
                 meet = [rho * np.sin(angle) for rho in (inner, outer) for angle in (a, b)]
                 meet += [np.tan(a), np.tan(b)]
                 add(np.array([origin, step_s, step_t]), np.where(live, inner * np.sin(a), 0.0), top_p,
-                    [(zero, zero, one, inner**2, -one), (zero, ray_b, zero, one, zero)],  # type: ignore[list-item]
-                    [(zero, zero, one, outer**2, -one),  # type: ignore[list-item]
+                    [(zero, zero, one, inner**2, -one), (zero, ray_b, zero, one, zero)],
+                    [(zero, zero, one, outer**2, -one),
                      (np.where(a > 0, 0.0, 1e300), np.where(a > 0, ray_a, 0.0), zero, one, zero)], meet)
     # Side faces have one side each way: padded with a copy to two, as on ±Y.
     both = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in below]

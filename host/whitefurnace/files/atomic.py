@@ -60,7 +60,8 @@ class Transaction:
                 self.staging(path).unlink()
 
 
-def write_atomic(path: str | os.PathLike[str], writer: Callable[[Path], object], into: Transaction | None = None) -> None:
+def write_atomic(path: str | os.PathLike[str], writer: Callable[[Path], object],
+                 into: Transaction | None = None) -> None:
     """Let `writer` write `.NAME.tmp` beside `path`, sync it and rename it to `path`, or stage it in `into`.
 
     Whatever is raised on the way, Ctrl-C too, the temporary file is removed and an existing target is left as
