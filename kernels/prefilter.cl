@@ -6,20 +6,20 @@
 // 5e-5 in one run, 7e-7 in chunks of 8192) and the result does not depend on the device.
 // partial: [split][4][outputs] = ∑K wL (rgb) and ∑K w. direction: [3][outputs]; outputs a multiple of W·T.
 
-// A sharp lobe needs a fine grid near r only. K = K (1 - ω) + K ω with ω a smooth step in s from 0 at s0 to 1
-// at s1: the first part has compact support and goes over the fine grid, whole blocks of sources skipped; the
-// second is smooth on the scale √(2 s1) and goes over a coarse grid. The sum is K exactly.
+// A sharp lobe needs a fine grid near r only. K = K (1 - ω) + K ω with ω a smooth step in q = |l - r|² from 0 at q0 to 1
+// at q1: the first part has compact support and goes over the fine grid, whole blocks of sources skipped; the
+// second is smooth on the scale √q1 and goes over a coarse grid. The sum is K exactly.
 #define WHOLE 0
 #define FAR 1
 #define NEAR 2
 #define BLOCK 64
 
 typedef struct {
-  scalar s0, per_s;  // ω's start and 1/(s1 - s0)
+  scalar q0, per_q;  // ω's start and 1/(q1 - q0)
 } Window;
 
-static inline real step_up(real s, Window window) {
-  const real t = fmin(fmax((s - window.s0) * window.per_s, (real)0), (real)1), t2 = t * t;
+static inline real step_up(real q, Window window) {
+  const real t = fmin(fmax((q - window.q0) * window.per_q, (real)0), (real)1), t2 = t * t;
   return t2 * t2 * (35 + t * (-84 + t * (70 - 20 * t)));  // three continuous derivatives
 }
 
@@ -43,10 +43,10 @@ static inline void add_sources(Outputs *o, __global const scalar *restrict sourc
     const scalar px = p[0], py = p[1], pz = p[2], pw = p[3], pr = p[4], pg = p[5], pb = p[6];
     for (int t = 0; t < T; t++) {
       const real dx = o->x[t] - px, dy = o->y[t] - py, dz = o->z[t] - pz;
-      const real s = (scalar)0.5 * (dx * dx + dy * dy + dz * dz);
-      real K = lobe(s NDF_VALUES);
-      if (part == FAR) K *= step_up(s, window);
-      if (part == NEAR) K *= 1 - step_up(s, window);
+      const real q = dx * dx + dy * dy + dz * dz;
+      real K = lobe(q NDF_VALUES);
+      if (part == FAR) K *= step_up(q, window);
+      if (part == NEAR) K *= 1 - step_up(q, window);
       o->sum[0][t] += K * pr;
       o->sum[1][t] += K * pg;
       o->sum[2][t] += K * pb;
@@ -74,10 +74,10 @@ __kernel void convolve(__global scalar *restrict partial, const int outputs, con
 
 __kernel void convolve_far(__global scalar *restrict partial, const int outputs, const int sources, const int chunk,
                            const int first_split, __global const scalar *restrict direction,
-                           __global const scalar *restrict source, const scalar s0, const scalar s1 NDF_SCALARS) {
+                           __global const scalar *restrict source, const scalar q0, const scalar q1 NDF_SCALARS) {
   const int g = get_global_id(0) * T, split = get_global_id(1);
   if ((g + T) * W > outputs) return;
-  const Window window = {s0, 1 / (s1 - s0)};
+  const Window window = {q0, 1 / (q1 - q0)};
   Outputs o;
   load_outputs(&o, g, outputs, direction);
   add_sources(&o, source, split * chunk, min(sources, (split + 1) * chunk), FAR, window NDF_VALUES);
@@ -88,13 +88,13 @@ __kernel void convolve_far(__global scalar *restrict partial, const int outputs,
 // skipped when no pair can be nearer than the window's end, by the triangle inequality.
 __kernel void convolve_near(__global scalar *restrict partial, const int outputs, const int sources, const int chunk,
                             const int first_split, __global const scalar *restrict direction,
-                            __global const scalar *restrict source, const scalar s0, const scalar s1,
+                            __global const scalar *restrict source, const scalar q0, const scalar q1,
                             __global const scalar *restrict group, __global const scalar *restrict block NDF_SCALARS) {
   const int item = get_global_id(0), g = item * T, split = get_global_id(1);
   if ((g + T) * W > outputs) return;
-  const Window window = {s0, 1 / (s1 - s0)};
+  const Window window = {q0, 1 / (q1 - q0)};
   const scalar cx = group[4 * item], cy = group[4 * item + 1], cz = group[4 * item + 2];
-  const scalar reach = sqrt(2 * s1) + group[4 * item + 3];
+  const scalar reach = sqrt(q1) + group[4 * item + 3];
   Outputs o;
   load_outputs(&o, g, outputs, direction);
   for (int k = split * chunk; k < min(sources, (split + 1) * chunk); k += BLOCK) {

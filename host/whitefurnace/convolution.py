@@ -222,10 +222,10 @@ class Convolver:
         size = self.device.local_size
         self.device.launch(kernel, (-(-count // size) * size,), args)
 
-    def _finest(self, n: int, alpha: float) -> tuple[int, Buffer]:
+    def _finest(self, n: int, alpha: float, tolerance: float = 1e-4) -> tuple[int, Buffer]:
         """The anterpolated grid made straight from the texels; coarser ones are made from it."""
         if self._fine is None or self._fine[0] < n:
-            cuts = planning.cuts_for(self.texel, alpha, 1e-4)
+            cuts = planning.cuts_for(self.texel, alpha, tolerance)
             grid = self.device.empty((6, n, n, 4), np.float32)
             moments = self.device.empty(((n - 1) ** 2, planning.ORDER**2 * 4), np.float32)
             for face in range(6):
@@ -236,9 +236,9 @@ class Convolver:
             self._grids.clear()
         return self._fine
 
-    def prepare(self, n: int, alpha: float) -> None:
+    def prepare(self, n: int, alpha: float, tolerance: float) -> None:
         """Makes the finest grid that a set of levels will need, so that none is made from the texels twice."""
-        self._finest(n, alpha)
+        self._finest(n, alpha, tolerance)
 
     def _grid(self, n: int, alpha: float) -> Buffer:
         """The source list of the n × n grid."""
@@ -330,7 +330,7 @@ class Convolver:
             chunks = -(-count // planning.CHUNK) + (-(-far.shape[0] // planning.CHUNK) if far else 0)
             partial = self.device.empty((chunks, 4, padded), np.float32)
             if split and far and blocks:
-                window = np.float32(split.s0), np.float32(split.s1)
+                window = np.float32(split.q0), np.float32(split.q1)
                 groups = self.device.array(_bounds(part, group).astype(np.float32))
                 splits = self._partials(lobe, listed, count, block, partial, 0, "convolve_near", *window, groups,
                                         blocks)

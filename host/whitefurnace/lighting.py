@@ -107,7 +107,7 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
     # The finest grid first: the coarser ones are made from it.
     grids = [(job.plan.grid, job.lobe.alpha) for job in jobs if job.lobe]
     if grids:
-        convolver.prepare(*max(grids))
+        convolver.prepare(*max(grids), tolerance)
     work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0)
             for job in jobs]
     done = 0

@@ -67,7 +67,7 @@ def pairs_of(outputs: int, grid: int, alpha: float) -> int:
     split = split_for(grid, alpha)
     if split is None:
         return outputs * 6 * grid**2
-    return int(outputs * 6 * (grid**2 * split.s1 / 2 + split.grid**2))
+    return int(outputs * 6 * (grid**2 * split.q1 / 4 + split.grid**2))
 
 
 def grid_size(alpha: float, tolerance: float) -> int:
@@ -99,10 +99,10 @@ def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0) -
 
 @dataclass(frozen=True)
 class Split:
-    """A lobe in two parts: within the chord √(2 s1) over the fine grid, beyond s0 over `grid` nodes an edge."""
+    """A lobe in two parts: within the squared chord q1 over the fine grid, beyond q0 over `grid` nodes an edge."""
 
-    s0: float
-    s1: float
+    q0: float
+    q1: float
     grid: int
 
 
@@ -123,8 +123,8 @@ def split_for(n: int, alpha: float) -> Split | None:
         return None
     far = n / sharp * max(FAR_NODES / theta, FLOOR + KINK * alpha)
     far = 8 * math.ceil(far / 8)
-    s1 = 1 - math.cos(theta)
-    return Split(s1 / 16, s1, far) if far <= n / 2 else None
+    q1 = 2 - 2 * math.cos(theta)
+    return Split(q1 / 16, q1, far) if far <= n / 2 else None
 
 
 def plan_chain(chain: Chain, texel: float, share: float = 0.0) -> tuple[LevelPlan, ...]:

@@ -221,7 +221,7 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
 
     r_up = np.where(pole, 0, row_of(p_up * cosine + q_up * sine))
     r_down = np.maximum(row_of(p_down * cosine + q_down * sine), r_up)
-    column = np.floor(middle * per + zero[own]).astype(np.int64) % columns
+    column: Ints = np.mod(np.floor(middle * per + zero[own]).astype(np.int64), columns)
 
     # ∫ (1 - y) dφ of both sides. Singularities lie at least .46 from a piece of at most 2π/columns, or k times
     # its length where sides seen from the pole make it shorter: 12 nodes leave 1e-14, 6 and 4 leave 1e-12.
@@ -253,10 +253,10 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
     n, r = _ranges(r_up[short] + 1, r_down[short])
     n = short[n]
     sums += _sum_by(own[n], (width[n] * step[r])[:, None] * radiance(r, column[n], flip[n]), m)
-    for k in np.flatnonzero(r_last - r_first > TALL):
-        here = np.flatnonzero(own == k)
+    for number in np.flatnonzero(r_last - r_first > TALL):
+        here = np.flatnonzero(own == number)
         top, bottom = int(r_up[here].min()), int(r_down[here].max()) + 1
-        sums[k] += _between(texels[::-1] if south[k] else texels, top, bottom, step, column[here], width[here],
+        sums[number] += _between(texels[::-1] if south[number] else texels, top, bottom, step, column[here], width[here],
                             r_up[here] + 1 - top, r_down[here] - top)
     return sums, area
 
@@ -369,15 +369,19 @@ def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Fl
                    count)
     area = np.bincount(own, first + last, count).astype(np.float64)
 
-    # Texels wholly between the two sides, by Gauss nodes too: exact where the piece spans the column.
-    k, r = _ranges(r0 + 1, r1)
-    if len(k):
+    # Texels wholly between the two sides, by Gauss nodes too, in pieces of bounded memory.
+    between = np.cumsum(np.maximum(r1 - r0 - 1, 0))
+    total = int(between[-1]) if len(between) else 0
+    pieces = [int(np.searchsorted(between, full)) for full in range(0, total, BLOCK)] + [len(own)]
+    x, w = gauss(8 if n < 16 else 4)
+    for begin, end in zip(pieces[:-1], pieces[1:], strict=True):
+        k, r = _ranges(r0[begin:end] + 1, r1[begin:end])
+        k += begin
         a, b = 2 * r / n - 1, 2 * (r + 1) / n - 1
         weight = np.zeros(len(k))
-        x, w = gauss(8 if n < 16 else 4)
         for xk, wk in zip(x, w, strict=True):
-            q = 1 + (s0 + width * xk) ** 2
-            q, inverse = q[k], (wk * width / q)[k]
+            q = 1 + (s0[begin:end] + width[begin:end] * xk) ** 2
+            q, inverse = q[k - begin], (wk * width[begin:end] / q)[k - begin]
             weight += inverse * (b / np.sqrt(q + b * b) - a / np.sqrt(q + a * a))
         sums += _sum_by(own[k], weight[:, None] * texels[origin[k] + r * step[k]], count)
         area += np.bincount(own[k], weight, count)
