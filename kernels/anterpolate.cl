@@ -161,7 +161,7 @@ __kernel void coarsen(__global scalar *restrict out, __global const scalar *rest
   for (int c = 0; c < 4; c++) out[4 * (size_t)g + c] = sum[c];
 }
 
-// The grid as the list that `convolve` reads, in blocks of 8 × 8 nodes (n is a multiple of 8), its directions from
+// The grid as the list that `convolve` reads, in blocks of 4 × 4 nodes within 8 × 8 (n is a multiple of 8), its directions from
 // the tangent table of n coordinates.
 __kernel void grid_list(__global scalar *restrict list, const int n, __global const scalar *restrict tangent,
                         __global const scalar *restrict grid) {
@@ -171,7 +171,7 @@ __kernel void grid_list(__global scalar *restrict list, const int n, __global co
   const vec3 d = unit3(cube_direction(face, tangent[j], tangent[i]));
   __global const scalar *q = grid + 4 * (size_t)g;
   const int block = (face * (n / 8) + i / 8) * (n / 8) + j / 8;
-  __global scalar *p = list + 8 * ((size_t)block * 64 + i % 8 * 8 + j % 8);
+  __global scalar *p = list + 8 * ((size_t)block * 64 + (i % 8 / 4 * 2 + j % 8 / 4) * 16 + i % 4 * 4 + j % 4);
   p[0] = d.x; p[1] = d.y; p[2] = d.z; p[3] = q[3];
   p[4] = q[0]; p[5] = q[1]; p[6] = q[2]; p[7] = 0;
 }

@@ -65,17 +65,19 @@ __kernel void cut_edges(__global scalar *restrict edge, const int size, const in
     const int c0 = (int)floor((start + p) * per), c1 = (int)floor((start + q) * per);
     scalar psi = p, asin_psi = asin(B * sin(p));
     int r = clamp((int)floor((HALF_PI - atan(A * cos(p))) / PI * rows), 0, rows - 1);
+    // Away from ψ = 0 the edge nears the equator: rows grow in the north (A > 0), fall in the south.
+    const int step = (A > 0) == half_edge ? 1 : -1;
     for (int c = c0; c <= c1; c++) {
       const scalar b = c == c1 ? q : fmin(q, (c + 1) / per - start);
       if (!(b > psi)) continue;
       const int column = ((c % columns) + columns) % columns;
-      const int last = clamp((int)floor((HALF_PI - atan(A * cos(b))) / PI * rows), 0, rows - 1);
-      const int step = r <= last ? 1 : -1;
-      for (;; r += step) {
+      const scalar cot_b = A * cos(b);
+      for (;;) {
+        const scalar cot_edge = row_edge[2 * (step > 0 ? r + 1 : r) + 1];
+        const int crosses = step > 0 ? cot_b < cot_edge && r + 1 < rows : cot_b > cot_edge && r > 0;
         scalar next = b;
-        if (r != last) {
-          const scalar cosine = row_edge[2 * (step > 0 ? r + 1 : r) + 1] / A;
-          const scalar crossing = acos(clamp(cosine, (scalar)-1, (scalar)1));
+        if (crosses) {
+          const scalar crossing = acos(clamp(cot_edge / A, (scalar)-1, (scalar)1));
           next = clamp(half_edge ? crossing : -crossing, psi, b);
         }
         const scalar asin_next = asin(B * sin(next));
@@ -88,7 +90,8 @@ __kernel void cut_edges(__global scalar *restrict edge, const int size, const in
         }
         psi = next;
         asin_psi = asin_next;
-        if (r == last) break;
+        if (!crosses) break;
+        r += step;
       }
     }
   }

@@ -12,7 +12,7 @@
 #define WHOLE 0
 #define FAR 1
 #define NEAR 2
-#define BLOCK 64
+#define BLOCK 16
 
 typedef struct {
   scalar q0, per_q;  // ω's start and 1/(q1 - q0)
@@ -84,8 +84,14 @@ __kernel void convolve_far(__global scalar *restrict partial, const int outputs,
   store_outputs(&o, g, outputs, partial + (size_t)(first_split + split) * 4 * outputs);
 }
 
-// group, block: {x, y, z, radius} of the W·T outputs of a work item and of BLOCK sources, as chords: a block is
-// skipped when no pair can be nearer than the window's end, by the triangle inequality.
+// group, block: {x, y, z, radius} of the W·T outputs of a work item, and for every 4 BLOCK sources of them all,
+// then of each BLOCK: a block is skipped when no pair can be nearer than the window's end, by the triangle
+// inequality of chords.
+static inline int out_of_reach(__global const scalar *restrict bound, scalar x, scalar y, scalar z, scalar reach) {
+  const scalar dx = bound[0] - x, dy = bound[1] - y, dz = bound[2] - z, apart = reach + bound[3];
+  return dx * dx + dy * dy + dz * dz > apart * apart;
+}
+
 __kernel void convolve_near(__global scalar *restrict partial, const int outputs, const int sources, const int chunk,
                             const int first_split, __global const scalar *restrict direction,
                             __global const scalar *restrict source, const scalar q0, const scalar q1,
@@ -97,11 +103,12 @@ __kernel void convolve_near(__global scalar *restrict partial, const int outputs
   const scalar reach = sqrt(q1) + group[4 * item + 3];
   Outputs o;
   load_outputs(&o, g, outputs, direction);
-  for (int k = split * chunk; k < min(sources, (split + 1) * chunk); k += BLOCK) {
-    __global const scalar *b = block + 4 * (k / BLOCK);
-    const scalar dx = b[0] - cx, dy = b[1] - cy, dz = b[2] - cz, apart = reach + b[3];
-    if (dx * dx + dy * dy + dz * dz > apart * apart) continue;
-    add_sources(&o, source, k, k + BLOCK, NEAR, window NDF_VALUES);
+  for (int k = split * chunk; k < min(sources, (split + 1) * chunk); k += 4 * BLOCK) {
+    __global const scalar *bound = block + 20 * (k / (4 * BLOCK));
+    if (out_of_reach(bound, cx, cy, cz, reach)) continue;
+    for (int b = 0; b < 4; b++)
+      if (!out_of_reach(bound + 4 + 4 * b, cx, cy, cz, reach))
+        add_sources(&o, source, k + b * BLOCK, k + (b + 1) * BLOCK, NEAR, window NDF_VALUES);
   }
   store_outputs(&o, g, outputs, partial + (size_t)(first_split + split) * 4 * outputs);
 }

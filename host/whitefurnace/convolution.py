@@ -28,6 +28,7 @@ Progress = Callable[[str, float], None]
 ROUNDING = 4e-6
 
 HARMONICS_CHUNK = 1024
+BLOCK = 16  # sources that `convolve_near` takes or leaves together
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,12 @@ class Shape:
         return _latlong_directions(self.size) if self.latlong else _cube_directions(self.size)
 
     def tiled(self) -> np.ndarray:
-        """Flat indices in an order that keeps neighbours together: tiles of 8 × 8, row by row."""
+        """Flat indices in an order that keeps neighbours together: tiles of 4 × 4 within tiles of 8 × 8."""
         index = np.arange(self.count).reshape(-1, *self.dims[-2:])
         planes, height, width = index.shape
         if height % 8 or width % 8:
             return index.ravel()
-        return index.reshape(planes, height // 8, 8, width // 8, 8).transpose(0, 1, 3, 2, 4).ravel()
+        return index.reshape(planes, height // 8, 2, 4, width // 8, 2, 4).transpose(0, 1, 4, 2, 5, 3, 6).ravel()
 
     def solid_angles(self) -> np.ndarray:
         """(count,) float64."""
@@ -120,6 +121,14 @@ def _bounds(directions: np.ndarray, count: int) -> np.ndarray:
     centre = d.mean(2)
     radius = np.sqrt(((d - centre[..., None]) ** 2).sum(0).max(1))
     return np.concatenate([centre, radius[None] * (1 + 1e-6) + 1e-6]).T.copy()
+
+
+@cache
+def _block_bounds(n: int) -> np.ndarray:
+    """(6 n²/64, 5, 4) float32: bounds of every 64 sources of the n × n grid, then of each BLOCK of them."""
+    directions = _grid_directions(n)
+    outer, inner = _bounds(directions, 4 * BLOCK), _bounds(directions, BLOCK)
+    return np.concatenate([outer[:, None], inner.reshape(-1, 4, 4)], 1).astype(np.float32)
 
 
 def lobe_norm(ndf: Model, parameters: dict[str, float]) -> float:
@@ -313,7 +322,7 @@ class Convolver:
         split = planning.split_for(n, lobe.alpha)
         listed, bright = self._grid(n, lobe.alpha), self._bright_list(self._bright_cuts(lobe, tolerance))
         far = self._grid(split.grid, lobe.alpha) if split else None
-        blocks = self.device.array(_bounds(_grid_directions(n), 64).astype(np.float32)) if split else None
+        blocks = self.device.array(_block_bounds(n)) if split else None
         group = self._step
         step = group * self.device.local_size
         count = listed.shape[0]

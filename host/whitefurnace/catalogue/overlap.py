@@ -8,6 +8,7 @@ a side lies in are fixed, so a texel is left with rounding only.
 """
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -256,8 +257,8 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
     for number in np.flatnonzero(r_last - r_first > TALL):
         here = np.flatnonzero(own == number)
         top, bottom = int(r_up[here].min()), int(r_down[here].max()) + 1
-        sums[number] += _between(texels[::-1] if south[number] else texels, top, bottom, step, column[here], width[here],
-                            r_up[here] + 1 - top, r_down[here] - top)
+        sums[number] += _between(texels[::-1] if south[number] else texels, top, bottom, step, column[here],
+                                 width[here], r_up[here] + 1 - top, r_down[here] - top)
     return sums, area
 
 
@@ -374,7 +375,7 @@ def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Fl
     total = int(between[-1]) if len(between) else 0
     pieces = [int(np.searchsorted(between, full)) for full in range(0, total, BLOCK)] + [len(own)]
     x, w = gauss(8 if n < 16 else 4)
-    for begin, end in zip(pieces[:-1], pieces[1:], strict=True):
+    for begin, end in itertools.pairwise(pieces):
         k, r = _ranges(r0[begin:end] + 1, r1[begin:end])
         k += begin
         a, b = 2 * r / n - 1, 2 * (r + 1) / n - 1
