@@ -29,7 +29,8 @@ def texel_nodes(texels: np.ndarray, rotation: float, cuts: int) -> tuple[np.ndar
                       ((rows, math.pi), (columns, 2 * math.pi)))
         phi = phi - math.pi
         i, j = np.repeat(np.arange(rows), cuts), np.repeat(np.arange(columns), cuts)
-        weight = np.outer(np.tile(w, rows) * np.sin(theta) * math.pi / rows, np.tile(w, columns) * 2 * math.pi / columns)
+        weight = np.outer(np.tile(w, rows) * np.sin(theta) * math.pi / rows,
+                          np.tile(w, columns) * 2 * math.pi / columns)
         y = np.broadcast_to(np.cos(theta)[:, None], weight.shape)
         d = np.stack([np.outer(np.sin(theta), np.cos(phi)), y, np.outer(np.sin(theta), np.sin(phi))], -1)
         index = i[:, None] * columns + j
@@ -92,7 +93,8 @@ def ggx_lobe_norm(alpha: float) -> float:
 # ------------------------------------------------------------------------------------- GGX, 1-D
 
 
-def ggx_albedo_1d(NoV: np.ndarray, alpha: np.ndarray, n: int = 64, azimuths: int = 48) -> tuple[np.ndarray, np.ndarray]:
+def ggx_albedo_1d(NoV: np.ndarray, alpha: np.ndarray, n: int = 96,
+                  azimuths: int = 80) -> tuple[np.ndarray, np.ndarray]:
     """(E, Fc): albedo of GGX with height-correlated Smith and F = 1, and its Schlick part, (cells,) float64 each.
 
     Over l, not over half vectors. At fixed l.z the masking does not depend on azimuth and D is rational in
@@ -100,7 +102,8 @@ def ggx_albedo_1d(NoV: np.ndarray, alpha: np.ndarray, n: int = 64, azimuths: int
     Δ = √(AB), R = (A + B)/2, its integral over azimuth is Φ = 2α²(1 + 2κ/Δ + κ²R/Δ³), and
     E = ∫ l.z/(2(l.z S_v + n·v S_l)) Φ d(l.z) with S = √(z² + α² sin²). The Fresnel part is summed in ψ with
     tan(φ'/2) = √(A/B) tan(ψ/2), φ' = π - φ, which spreads the peak of D. θ_l runs over panels graded like sinh
-    from θ_v both ways and from π/2. A = scale = bias follow as (E - Fc, Fc).
+    from θ_v both ways and from π/2. The pair of the split sum is (E - Fc, Fc). Error: 2e-8 for n·v and α ≥ 1e-4
+    (against 1.5 times the nodes).
     """
     sv = np.sqrt((1 - NoV) * (1 + NoV))
     tv = np.arctan2(sv, NoV)
@@ -145,11 +148,12 @@ def ggx_albedo_1d(NoV: np.ndarray, alpha: np.ndarray, n: int = 64, azimuths: int
 def albedo_over_lights(D: Callable[[np.ndarray], np.ndarray], G: Callable[[np.ndarray, np.ndarray], np.ndarray],
                        F: Callable[[np.ndarray], np.ndarray], NoV: float, width: float, n: int = 96) -> float:
     """E = ∫ F(v·h) D(n·h) G(n·v, n·l) / (4 n·v) dω_l, by Gauss panels in θ_l and φ graded around the mirror
-    direction. `width` is the polar angle in which D falls; good to 1e-7 for width ≥ .05 and n·v ≥ .05."""
+    direction. `width` is the polar angle in which D falls; good to 1e-7 for width ≥ .2 and n·v ≥ .3."""
     tv = math.acos(NoV)
     x, w = gauss(n)
     total = 0.0
-    for start, sign, length in ((tv, -1, tv), (tv, 1, (math.pi / 2 - tv) / 2), (math.pi / 2, -1, (math.pi / 2 - tv) / 2)):
+    rest = (math.pi / 2 - tv) / 2
+    for start, sign, length in ((tv, -1, tv), (tv, 1, rest), (math.pi / 2, -1, rest)):
         span = math.asinh(length / width)
         theta = start + sign * width * np.sinh(span * x)
         dtheta = width * np.cosh(span * x) * span * w

@@ -359,7 +359,7 @@ def test_json_is_json_lines_only(tmp_path, shell):
         assert shell("bake", source, "-o", out, *SMALL, "--json", *arguments) == 0
         rows = shell.rows()
         assert [row["event"] for row in rows] == ["level"] * 3 + [last]
-        assert [(row["size"], row["roughness"]) for row in rows[:3]] == pytest.approx(LEVELS)
+        assert [(row["size"], round(row["roughness"], 6)) for row in rows[:3]] == [(n, round(r, 6)) for n, r in LEVELS]
         assert {"key", "files", "seconds"} <= set(rows[-1]) and shell.err == ""
     assert shell("bake", tmp_path / "none.exr", "-o", out, "--json") == 2
     assert shell.rows() == [{"event": "error", "message": shell.sentence()[7:], "exit_code": 2}]
@@ -407,9 +407,9 @@ def test_a_model_from_a_file_is_not_supported_yet(tmp_path, shell):
     assert "my_lobe.clh" in shell.sentence()
 
 
-def test_an_unknown_device_exits_4(tmp_path, shell):
+def test_an_unknown_device_is_a_usage_error(tmp_path, shell):
     source = image(tmp_path / "a.exr", noise(height=2))
-    assert shell("bake", source, "-o", tmp_path / "out", *SMALL, "--device", "no such device") == 4
+    assert shell("bake", source, "-o", tmp_path / "out", *SMALL, "--device", "no such device") == 1
     assert "no such device" in shell.sentence()
     assert tree(tmp_path) == {"a.exr": source.read_bytes()}
 
@@ -596,16 +596,28 @@ def test_a_folder_without_permission(tmp_path, shell):
     assert str(out) in shell.sentence() and tree(out) == {}
 
 
-def test_files_that_may_not_grow(tmp_path):
+def test_files_that_may_not_grow(tmp_path, shell, monkeypatch):
     """A limit on file size stands in for a full disk where nothing can be mounted."""
     resource = pytest.importorskip("resource")
     source, out = image(tmp_path / "a.exr", noise()), tmp_path / "out"
     bake(source, out, **SIZES)
     before = tree(out)
-    done = subprocess.run(command("bake", source, "-o", out, *SMALL, "--exposure", "1"), capture_output=True, text=True,
-                          preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)))
-    assert done.returncode == 2 and "Traceback" not in done.stderr, done.stderr
-    assert done.stderr.startswith("error: ") and len(done.stderr.splitlines()) == 1
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    enter, leave = Transaction.__enter__, Transaction.__exit__
+
+    # Only while results are written: the OpenCL compiler writes files too.
+    def limited(self):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+        return enter(self)
+
+    def unlimited(self, *error):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        leave(self, *error)
+
+    monkeypatch.setattr(Transaction, "__enter__", limited)
+    monkeypatch.setattr(Transaction, "__exit__", unlimited)
+    assert shell("bake", source, "-o", out, *SMALL, "--exposure", "1") == 2
+    assert str(out) in shell.sentence()
     assert tree(out) == before
 
 
@@ -652,7 +664,8 @@ def test_ctrl_c_leaves_nothing_half_written(tmp_path, delay):
     run.send_signal(signal.SIGINT)
     told, complaint = run.communicate(timeout=60)
     assert run.returncode == 130, complaint
-    assert told == "" and complaint.startswith("interrupted") and len(complaint.splitlines()) == 1
+    # click ends the terminal's line with ^C on it first.
+    assert told == "" and complaint.strip().startswith("interrupted") and len(complaint.strip().splitlines()) == 1
     assert tree(out) == {}
 
 

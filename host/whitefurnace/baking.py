@@ -100,7 +100,8 @@ def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str =
         if isinstance(item, Environment):
             names.append(item.name)
         elif isinstance(item, (str, os.PathLike)):
-            names.append(Path(os.path.abspath(item)).stem if not _is_demo(item) else DEMO)
+            path = Path(os.path.abspath(item))
+            names.append(DEMO if _is_demo(item) else path.name if path.is_dir() else path.stem)
         else:
             raise UsageError("bake takes paths; make an environment of an array first and give it a name")
     for k, name in enumerate(names):
@@ -153,26 +154,28 @@ def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_
     files = tuple(t.path for t in targets)
     sizes = tuple(t.nbytes for t in targets)
     path = request.output / f"{name}.json"
-    known = _manifests(path, name)
-    if not request.force and known and known[0].get("key") == key and _whole(known[0], request.output):
-        return Baked(name, "skipped", files, known[0], planned, sizes, env.notices,
-                     tuple(known[0].get("levels", ())), time.perf_counter() - begin)
+    there = _manifest_at(path, name)
+    if not request.force and there and there.get("key") == key and _whole(there, request.output):
+        return Baked(name, "skipped", files, there, planned, sizes, env.notices,
+                     tuple(there.get("levels", ())), time.perf_counter() - begin)
+    # Ours is also what the manifest proves that a killed run left staged.
+    known = [m for m in (there, _manifest_at(Transaction.staging(path), name)) if m]
     _check_ownership([*files, path], known, request, path)
     if dry_run:
         return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, env.notices)
-    _check_writable(request.output)
+    for folder in sorted({request.output, *(file.parent for file in files)}):
+        _check_writable(folder)
     on = on or choose_device(device if isinstance(device, str) else None)
     tell = (lambda what, share: progress(name, what, share)) if progress else None
     lit = light(on, env, request.recipe, latlong=any(e.latlong for e in request.engines), seed=key, progress=tell)
     table = dfg(DFG_SIZE, ndf=request.recipe.ndf.model, tolerance=DFG_TOLERANCE, device=on)
-    manifest = _manifest(env, recipe, key, on, lit, table)
+    manifest = _manifest(name, env, recipe, key, on, lit, table)
     with Transaction() as transaction:
         digests = {}
         provenance = {"version": VERSION, "key": key, "source": env.digest,
                       "recipe": json.dumps(recipe, sort_keys=True)}
         for target in _targets(request, name, lit, table, provenance):
             assert target.write is not None
-            target.path.parent.mkdir(parents=True, exist_ok=True)
             target.write(transaction)
             digests[target.path.relative_to(request.output).as_posix()] = {
                 "sha256": digest_file(transaction.staged(target.path)),
@@ -202,17 +205,18 @@ def _key(env: Environment, recipe: dict[str, Any]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def _manifests(path: Path, name: str) -> list[dict[str, Any]]:
-    """Our manifest of this item, and one that a killed run left staged: both prove what is ours."""
-    found = [read_manifest(p) for p in (path, Transaction.staging(path))]
-    return [m for m in found if m is not None and m.get("name") == name]
+def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
+    """The manifest of this item at `path`, or None where there is none that could prove anything."""
+    found = read_manifest(path)
+    if found is None or found.get("name") != name:
+        return None
+    files = found.get("files")
+    sound = isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values())
+    return found if sound else None
 
 
 def _whole(manifest: dict[str, Any], output: Path) -> bool:
-    files = manifest.get("files")
-    if not isinstance(files, dict) or not files:
-        return False
-    for relative, entry in files.items():
+    for relative, entry in manifest["files"].items():
         path = output / relative
         if not path.is_file() or digest_file(path) != entry.get("sha256"):
             return False
@@ -223,18 +227,17 @@ def _check_ownership(paths: Sequence[Path], known: Sequence[dict[str, Any]], req
     """Refuses to replace what no manifest of ours proves to be ours for this item. Raises FileError."""
     if request.force:
         return
-    ours = {relative: entry.get("sha256") for m in reversed(known) for relative, entry in m.get("files", {}).items()}
-    candidates: dict[str, set[str]] = {}
+    ours: dict[str, set[Any]] = {}
     for m in known:
-        for relative, entry in m.get("files", {}).items():
-            candidates.setdefault(relative, set()).add(entry.get("sha256"))
+        for relative, entry in m["files"].items():
+            ours.setdefault(relative, set()).add(entry.get("sha256"))
     for path in paths:
         if not path.exists():
             continue
         if path == manifest and known:
             continue
         relative = path.relative_to(request.output).as_posix()
-        if relative not in ours or not path.is_file() or digest_file(path) not in candidates[relative]:
+        if relative not in ours or not path.is_file() or digest_file(path) not in ours[relative]:
             raise FileError(f"{path} is there and was not written by this bake; move it away or give --force")
 
 
@@ -250,7 +253,7 @@ def _check_writable(output: Path) -> None:
         raise FileError(f"cannot write into {output}: {error.strerror or error}") from error
 
 
-def _manifest(env: Environment, recipe: dict[str, Any], key: str, device: Device, lit: Lighting,
+def _manifest(name: str, env: Environment, recipe: dict[str, Any], key: str, device: Device, lit: Lighting,
               table: Integrated) -> dict[str, Any]:
     def row(level: Any, kept: float | None = None) -> dict[str, Any]:
         data = {"size": level.texels.shape[-2], "roughness": level.roughness, "method": level.method,
@@ -259,7 +262,7 @@ def _manifest(env: Environment, recipe: dict[str, Any], key: str, device: Device
 
     return {
         "whitefurnace": VERSION,
-        "name": env.name,
+        "name": name,
         "key": key,
         "recipe": recipe,
         "device": device.identity(),

@@ -165,6 +165,11 @@ def _progress(wanted: bool) -> Iterator[Callable[[str, str, float], None] | None
         yield tell
 
 
+def _abandon_stdout() -> None:
+    """What is left to be flushed goes nowhere, so that Python's own flush at exit does not complain."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
 def main(argv: list[str] | None = None) -> None:
     """Entry point: runs the command and turns every error into one sentence and its exit code."""
     try:
@@ -185,7 +190,11 @@ def main(argv: list[str] | None = None) -> None:
         _say("interrupted: nothing half-written was left")
         code = 130
     except BrokenPipeError:  # the reader of stdout went away; what it did not read cannot be flushed either
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _abandon_stdout()
+        code = 2
+    except OSError as error:  # stdout is full; files have errors of their own
+        _abandon_stdout()
+        _say(f"error: cannot write the results: {error.strerror or error}")
         code = 2
     except MemoryError:
         _say("error: there is not enough memory for this; a smaller input or size is needed")

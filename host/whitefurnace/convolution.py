@@ -23,9 +23,9 @@ from whitefurnace.recipe import Chosen
 Progress = Callable[[str, float], None]
 """Called with what is being done and its share of the whole, 0 to 1."""
 
-# What float32 leaves in a certified error however close the two sums: directions and partial sums, measured
-# against float64 in tests/test_prefilter.py.
-ROUNDING = 4e-6
+# What a certified error may hide of rounding: float32 leaves up to 3e-5 on the darkest texels of a studio and a
+# tenth of that in the median, measured against float64 in another form (tests/test_prefilter_kernels.py).
+ROUNDING = {32: 2e-5, 64: 2e-7}
 
 HARMONICS_CHUNK = 1024
 BLOCK = 16  # sources that `convolve_near` takes or leaves together
@@ -125,10 +125,10 @@ def _bounds(directions: np.ndarray, count: int) -> np.ndarray:
 
 @cache
 def _block_bounds(n: int) -> np.ndarray:
-    """(6 n²/64, 5, 4) float32: bounds of every 64 sources of the n × n grid, then of each BLOCK of them."""
+    """(6 n²/64, 5, 4) float64: bounds of every 64 sources of the n × n grid, then of each BLOCK of them."""
     directions = _grid_directions(n)
     outer, inner = _bounds(directions, 4 * BLOCK), _bounds(directions, BLOCK)
-    return np.concatenate([outer[:, None], inner.reshape(-1, 4, 4)], 1).astype(np.float32)
+    return np.concatenate([outer[:, None], inner.reshape(-1, 4, 4)], 1)
 
 
 def lobe_norm(ndf: Model, parameters: dict[str, float]) -> float:
@@ -149,9 +149,12 @@ class Convolver:
     dark images inside float32; results are scaled back.
     """
 
-    def __init__(self, device: Device, environment: Environment, *, seed: str = "",
+    def __init__(self, device: Device, environment: Environment, *, precision: int = 32, seed: str = "",
                  progress: Progress | None = None) -> None:
         self.device = device
+        self.precision = precision if precision == 32 or device.fp64 else 32
+        self.kind = np.dtype(f"f{self.precision // 8}")
+        self.real = self.kind.type
         self.environment = environment
         self.seed = seed
         self.progress = progress or (lambda _what, _share: None)
@@ -201,7 +204,7 @@ class Convolver:
         clipped = texels.reshape(-1, 3).copy()
         original = clipped[index]
         clipped[index] = original * keep[:, None]
-        excess = original - clipped[index]
+        excess = original.astype(np.float64) - clipped[index]  # exact, so that no energy is lost to rounding
         real = excess.any(1)
         total = float(energy.sum(dtype=np.float64))
         self.share = float(level) / total if total > 0 else 0.0
@@ -214,18 +217,19 @@ class Convolver:
             x, w = (np.array([0.5]), np.array([1.0])) if cuts == 1 else _composite(cuts)
             tables = (_latlong_tables(self.rows, self.columns, x, w, self.environment.rotation) if self.latlong
                       else _cube_tables(self.rows, x, w))
-            self._tables[cuts] = tuple(self.device.array(t.astype(np.float32)) for t in tables)  # type: ignore[assignment]
+            rows, columns = (self.device.array(t.astype(self.kind)) for t in tables)
+            self._tables[cuts] = rows, columns
         return self._tables[cuts]
 
     def _texel_arguments(self, cuts: int, radiance: Buffer) -> tuple[Any, ...]:
         rows, columns = self._table(cuts)
         turn = self.environment.rotation
-        return (np.int32(self.rows), np.int32(self.columns), np.int32(cuts), np.float32(math.cos(turn)),
-                np.float32(math.sin(turn)), rows, columns, radiance)
+        return (np.int32(self.rows), np.int32(self.columns), np.int32(cuts), self.real(math.cos(turn)),
+                self.real(math.sin(turn)), rows, columns, radiance)
 
     def _texel_kernel(self, name: str) -> Kernel:
         return self.device.build(self._texel_program.text,
-                                 {"W": 1, "T": 1, "PRECISION": 32, "ORDER": planning.ORDER}).kernel(name)
+                                 {"W": 1, "T": 1, "PRECISION": self.precision, "ORDER": planning.ORDER}).kernel(name)
 
     def _launch(self, kernel: Kernel, count: int, args: Sequence[Any]) -> None:
         size = self.device.local_size
@@ -235,8 +239,8 @@ class Convolver:
         """The anterpolated grid made straight from the texels; coarser ones are made from it."""
         if self._fine is None or self._fine[0] < n:
             cuts = planning.cuts_for(self.texel, alpha, tolerance)
-            grid = self.device.empty((6, n, n, 4), np.float32)
-            moments = self.device.empty(((n - 1) ** 2, planning.ORDER**2 * 4), np.float32)
+            grid = self.device.empty((6, n, n, 4), self.kind)
+            moments = self.device.empty(((n - 1) ** 2, planning.ORDER**2 * 4), self.kind)
             for face in range(6):
                 self._launch(self._texel_kernel("anterpolate"), (n - 1) ** 2,
                              (moments, np.int32(n), np.int32(face), *self._texel_arguments(cuts, self._clipped)))
@@ -254,16 +258,16 @@ class Convolver:
         if n not in self._grids:
             fine, grid = self._finest(n, alpha)
             if n < fine:
-                matrix, first, last = (self.device.array(a) for a in _coarsening(fine, n))
+                matrix, first, last = (self.device.array(a) for a in _coarsening(fine, n, self.kind.char))
                 sizes = (np.int32(fine), np.int32(n))
-                half = self.device.empty((6, fine, n, 4), np.float32)
+                half = self.device.empty((6, fine, n, 4), self.kind)
                 self._launch(self._texel_kernel("coarsen"), 6 * fine * n,
                              (half, grid, matrix, first, last, *sizes, np.int32(1), np.int32(6 * fine)))
-                grid = self.device.empty((6, n, n, 4), np.float32)
+                grid = self.device.empty((6, n, n, 4), self.kind)
                 self._launch(self._texel_kernel("coarsen"), 6 * n * n,
                              (grid, half, matrix, first, last, *sizes, np.int32(n), np.int32(6 * n)))
-            tangent = np.tan(((2 * np.arange(n) + 1) / n - 1) * math.pi / 4).astype(np.float32)
-            listed = self.device.empty((6 * n * n, 8), np.float32)
+            tangent = np.tan(((2 * np.arange(n) + 1) / n - 1) * math.pi / 4).astype(self.kind)
+            listed = self.device.empty((6 * n * n, 8), self.kind)
             self._launch(self._texel_kernel("grid_list"), 6 * n * n, (listed, np.int32(n),
                                                                       self.device.array(tangent), grid))
             self._grids[n] = listed
@@ -274,10 +278,10 @@ class Convolver:
         index, excess = self._bright
         if not len(index):
             return None
-        listed = self.device.empty((len(index) * cuts * cuts, 8), np.float32)
+        listed = self.device.empty((len(index) * cuts * cuts, 8), self.kind)
         self._launch(self._texel_kernel("chosen_nodes"), len(index) * cuts * cuts,
                      (listed, np.int32(len(index)), self.device.array(index.astype(np.int32)),
-                      self.device.array(excess), *self._texel_arguments(cuts, self._clipped)))
+                      self.device.array(excess.astype(self.kind)), *self._texel_arguments(cuts, self._clipped)))
         return listed
 
     def _bright_cuts(self, lobe: Lobe, tolerance: float) -> int:
@@ -286,7 +290,7 @@ class Convolver:
     def _bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
         """Every node of the clipped source, in bands: (list, nodes in it, share done)."""
         total = self.faces * self.rows * self.columns * cuts * cuts
-        listed = self.device.empty((min(planning.NODES_A_BAND, total), 8), np.float32)
+        listed = self.device.empty((min(planning.NODES_A_BAND, total), 8), self.kind)
         for first in range(0, total, planning.NODES_A_BAND):
             count = min(planning.NODES_A_BAND, total - first)
             self._launch(self._texel_kernel("nodes"), count,
@@ -296,8 +300,8 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- lobes
 
     def _program(self, lobe: Lobe) -> Program:
-        return self.device.build(source.convolution(lobe.model).text,
-                                 {"W": self.device.lanes(32), "T": self.device.vectors, "PRECISION": 32})
+        return self.device.build(source.convolution(lobe.model).text, {
+            "W": self.device.lanes(self.precision), "T": self.device.vectors, "PRECISION": self.precision})
 
     def _partials(self, lobe: Lobe, listed: Buffer, count: int, directions: Buffer, partial: Buffer, first: int,
                   part: str = "convolve", *window: Any) -> int:
@@ -308,13 +312,13 @@ class Convolver:
         splits = -(-count // planning.CHUNK)
         self.device.launch(kernel, (outputs // step, splits),
                            (partial, np.int32(outputs), np.int32(count), np.int32(planning.CHUNK), np.int32(first),
-                            directions, listed, *window, *lobe.scalars))
+                            directions, listed, *window, *(self.real(value) for value in lobe.scalars)))
         return splits
 
     @property
     def _step(self) -> int:
         """Outputs of one work item."""
-        return self.device.lanes(32) * self.device.vectors
+        return self.device.lanes(self.precision) * self.device.vectors
 
     def convolve(self, lobe: Lobe, shape: Shape, n: int, tolerance: float,
                  share: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
@@ -322,7 +326,7 @@ class Convolver:
         split = planning.split_for(n, lobe.alpha)
         listed, bright = self._grid(n, lobe.alpha), self._bright_list(self._bright_cuts(lobe, tolerance))
         far = self._grid(split.grid, lobe.alpha) if split else None
-        blocks = self.device.array(_block_bounds(n)) if split else None
+        blocks = self.device.array(_block_bounds(n).astype(self.kind)) if split else None
         group = self._step
         step = group * self.device.local_size
         count = listed.shape[0]
@@ -335,12 +339,12 @@ class Convolver:
             index = order[begin:begin + tile]
             padded = -(-len(index) // step) * step
             part = np.pad(directions[:, index], ((0, 0), (0, padded - len(index))), mode="edge")
-            block = self.device.array(part.astype(np.float32))
+            block = self.device.array(part.astype(self.kind))
             chunks = -(-count // planning.CHUNK) + (-(-far.shape[0] // planning.CHUNK) if far else 0)
-            partial = self.device.empty((chunks, 4, padded), np.float32)
+            partial = self.device.empty((chunks, 4, padded), self.kind)
             if split and far and blocks:
-                window = np.float32(split.q0), np.float32(split.q1)
-                groups = self.device.array(_bounds(part, group).astype(np.float32))
+                window = self.real(split.q0), self.real(split.q1)
+                groups = self.device.array(_bounds(part, group).astype(self.kind))
                 splits = self._partials(lobe, listed, count, block, partial, 0, "convolve_near", *window, groups,
                                         blocks)
                 splits += self._partials(lobe, far, far.shape[0], block, partial, splits, "convolve_far", *window)
@@ -348,12 +352,12 @@ class Convolver:
                 splits = self._partials(lobe, listed, count, block, partial, 0)
             bright_splits, extra = 0, partial
             if bright is not None:
-                extra = self.device.empty((-(-bright.shape[0] // planning.CHUNK), 4, padded), np.float32)
+                extra = self.device.empty((-(-bright.shape[0] // planning.CHUNK), 4, padded), self.kind)
                 bright_splits = self._partials(lobe, bright, bright.shape[0], block, extra, 0)
-            level = self.device.empty((3, padded), np.float32)
-            self.device.launch(self._program(lobe).kernel("finish"), (padded // self.device.lanes(32),),
+            level = self.device.empty((3, padded), self.kind)
+            self.device.launch(self._program(lobe).kernel("finish"), (padded // self.device.lanes(self.precision),),
                                (level, np.int32(padded), partial, np.int32(splits), extra, np.int32(bright_splits),
-                                np.float32(1 / lobe.norm)))
+                                self.real(1 / lobe.norm)))
             out[index] = level.read().T[:len(index)]
             self.progress(lobe.name, share[0] + (share[1] - share[0]) * (begin + len(index)) / shape.count)
         return out.reshape(*shape.dims, 3)
@@ -369,7 +373,7 @@ class Convolver:
         for lobe, directions in wanted:
             padded = -(-directions.shape[1] // step) * step
             block = np.pad(directions, ((0, 0), (0, padded - directions.shape[1])), mode="edge")
-            jobs.append((lobe, self.device.array(block.astype(np.float32)), np.zeros((4, padded))))
+            jobs.append((lobe, self.device.array(block.astype(self.kind)), np.zeros((4, padded))))
         coefficients = np.zeros(28)
         for listed, count, _share in self._bands(cuts):
             coefficients += self._harmonic_sums(listed, count)
@@ -391,14 +395,14 @@ class Convolver:
 
     def _list_sums(self, lobe: Lobe, listed: Buffer, count: int, block: Buffer) -> np.ndarray:
         """(4, outputs) float64: ∑K wL and ∑K w of a whole list."""
-        partial = self.device.empty((-(-count // planning.CHUNK), 4, block.shape[1]), np.float32)
+        partial = self.device.empty((-(-count // planning.CHUNK), 4, block.shape[1]), self.kind)
         self._partials(lobe, listed, count, block, partial, 0)
         return partial.read().sum(0, dtype=np.float64)
 
     def _harmonic_sums(self, listed: Buffer, count: int) -> np.ndarray:
         """(28,) float64: 9 × 3 coefficients of a list, and ∑w."""
         chunks = -(-count // HARMONICS_CHUNK)
-        partial = self.device.empty((chunks, 28), np.float32)
+        partial = self.device.empty((chunks, 28), self.kind)
         self._launch(self._texel_kernel("harmonics"), chunks,
                      (partial, np.int32(count), np.int32(HARMONICS_CHUNK), np.int32(0), listed))
         return partial.read().sum(0, dtype=np.float64)
@@ -406,7 +410,7 @@ class Convolver:
     def harmonics(self) -> tuple[np.ndarray, float]:
         """Radiance coefficients (9, 3) in float64 from nodes of every texel, and their error over the largest
         L00: the difference to half as many nodes an edge, which bounds the finer rule's, and float32's part."""
-        cuts = max(2, planning.cuts_for(self.texel, 0.5, 1e-6))
+        cuts = 2 * math.ceil(self.texel / 0.05)  # pairs of Gauss points on .05 rad: 2e-8 for these polynomials
         fewer = 1 if cuts == 2 else 2 * (cuts // 4)
         for c in (cuts, fewer):
             if c not in self._harmonics:
@@ -529,7 +533,7 @@ class Lobe:
 
     name: str
     model: Model | None
-    scalars: tuple[Any, ...]
+    scalars: tuple[float, ...]
     norm: float
     alpha: float
 
@@ -537,7 +541,7 @@ class Lobe:
 def ndf_lobe(choice: Chosen, roughness: float, parameters: dict[str, float]) -> Lobe:
     """The prefilter's lobe of an NDF."""
     entry = choice.model
-    return Lobe(f"r = {roughness:.3f}", entry, tuple(np.float32(parameters[p.name]) for p in entry.parameters),
+    return Lobe(f"r = {roughness:.3f}", entry, tuple(parameters[p.name] for p in entry.parameters),
                  lobe_norm(entry, parameters), max(roughness * roughness, 1e-5))
 
 
@@ -594,7 +598,7 @@ def _latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
 
 
 @cache
-def _coarsening(fine: int, coarse: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _coarsening(fine: int, coarse: int, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The interpolation matrix (fine, coarse) between equiangular nodes, and for each coarse node the range
     [first, last) of fine nodes it takes part in."""
     order = min(planning.ORDER, coarse)
@@ -610,7 +614,7 @@ def _coarsening(fine: int, coarse: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     touched = (np.arange(coarse) >= start[:, None]) & (np.arange(coarse) < start[:, None] + order)
     first = touched.argmax(0)
     last = fine - touched[::-1].argmax(0)
-    return matrix.astype(np.float32), first.astype(np.int32), last.astype(np.int32)
+    return matrix.astype(kind), first.astype(np.int32), last.astype(np.int32)
 
 
 def statement(values: np.ndarray, reference: np.ndarray, uniform: int, solid_angle: np.ndarray,

@@ -2,6 +2,7 @@
 against the exact integral and refined where it misses the tolerance."""
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -102,7 +103,7 @@ def irradiance_job(convolver: Convolver, size: int, tolerance: float) -> Job:
 def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> list[Level]:
     """Makes, certifies and where needed refines every level, in the order of `jobs`.
 
-    Raises CheckError when a level misses the tolerance on the finest grid there is.
+    Raises CheckError when a level misses the tolerance and finer grids do not help.
     """
     # The finest grid first: the coarser ones are made from it.
     grids = [(job.plan.grid, job.lobe.alpha) for job in jobs if job.lobe]
@@ -124,12 +125,14 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
     levels = []
     for k, job in enumerate(jobs):
         level = _stated(convolver, job, texels[k], samples[k], references[k], seconds[k] + share)
+        before, stuck = math.inf, 0
         while level.error > tolerance:
             finer = planning.refined(job.plan) if job.lobe else None
-            if finer is None:
-                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g} on "
-                                 f"its finest grid, over the tolerance {tolerance:g}")
-            job = replace(job, plan=finer)
+            stuck = stuck + 1 if level.error > 0.9 * before else 0
+            if finer is None or stuck == 2:
+                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g}, over the "
+                                 f"tolerance {tolerance:g}, and a finer grid does not lower it")
+            job, before = replace(job, plan=finer), level.error
             begin = time.perf_counter()
             again = _make(convolver, job, tolerance, (0.8, 0.8))
             level = _stated(convolver, job, again, samples[k], references[k],
@@ -167,9 +170,10 @@ def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np
     flat = texels.reshape(-1, 3)
     mean = float((flat * solid[:, None]).sum() / (3 * solid.sum()))
     error, worst, rmse = statement(flat[index], reference, len(sample[0]), solid[index], mean, job.shape.count)
-    rounding = ROUNDING if mean > 0 else 0.0
-    if mean > 0 and job.lobe is not None and job.plan.cuts == 1 and not convolver.constant:
-        rounding += planning.KINK_ERROR * convolver.texel  # what the reference itself may be off by
+    # A mean over texels is made and checked in float64, and rounded once; elsewhere rounding has its own part.
+    rounding = 0.0 if mean == 0 else ROUNDING[64 if job.lobe is None else convolver.precision]
+    if mean > 0 and job.lobe and job.lobe.alpha > planning.SHARP_ENOUGH and not convolver.constant:
+        rounding += planning.KINK_ERROR * convolver.texel / job.plan.cuts**2  # what the reference may be off by
     if job.lobe is None:
         method, pairs = "texel-mean", 0
     else:
@@ -200,7 +204,8 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
     """The whole of an environment under one recipe, sharing grids and certificates. Raises CheckError where a
     level cannot reach the tolerance, DeviceError where the device fails."""
     begin = time.perf_counter()
-    convolver = Convolver(device, env, seed=seed, progress=progress)
+    convolver = Convolver(device, env, precision=planning.precision_for(recipe.tolerance), seed=seed,
+                          progress=progress)
     jobs = chain_jobs(convolver, recipe)
     wide = chain_jobs(convolver, recipe, latlong=True) if latlong else []
     everything = [*jobs, *wide, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance)]
@@ -239,7 +244,7 @@ def prefilter(source: Any, *, size: int = 256, min_size: int = 16, ndf: str | Mo
     begin = time.perf_counter()
     recipe = chain(ndf=ndf, size=size, min_size=min_size, tolerance=tolerance, quality=quality)
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
-    convolver = Convolver(_device(device), env)
+    convolver = Convolver(_device(device), env, precision=planning.precision_for(recipe.tolerance))
     levels = run_jobs(convolver, chain_jobs(convolver, recipe, latlong=latlong), recipe.tolerance)
     return Prefiltered(tuple(levels), time.perf_counter() - begin)
 
@@ -252,7 +257,7 @@ def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | N
     begin = time.perf_counter()
     bound = tolerance_of(tolerance, None)
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
-    convolver = Convolver(_device(device), env)
+    convolver = Convolver(_device(device), env, precision=planning.precision_for(bound))
     level = run_jobs(convolver, [irradiance_job(convolver, size, bound)], bound)[0]
     return Certified(level.texels, level.error, level.worst, level.rmse, level.pairs,
                      time.perf_counter() - begin, level.method)

@@ -24,7 +24,8 @@ NODES_A_BAND = 1 << 18
 
 # Nodes a face edge for a p99 error of 1e-3 on the hardest of the measured environments (studio, forest): the
 # sharp term follows the lobe's width, the floor the kink of (n·l)₊ at the horizon, which rough lobes carry to
-# full height. The error falls like n^-ORDER, so other tolerances scale n by (1e-3/tolerance)^(1/ORDER).
+# full height. The error falls like n^-ORDER, so other tolerances scale n by (1e-3/tolerance)^(1/ORDER); at
+# the kink like n^-2.
 SHARP, MARGIN, FLOOR, KINK = 3.2, 12, 28, 44
 LARGEST_GRID = 2048
 GROWTH = 1.5
@@ -36,6 +37,11 @@ since .99^299 = .0495 (order statistic)."""
 
 NEAR_BRIGHT = 64
 """Further texels, those nearest the brightest sources, where an error hides from a uniform draw."""
+
+
+def precision_for(tolerance: float) -> int:
+    """Working precision: float32 leaves up to 3e-5 on dark texels, so tight tolerances take float64."""
+    return 64 if tolerance < 1e-4 else 32
 
 
 @dataclass(frozen=True)
@@ -73,12 +79,15 @@ def pairs_of(outputs: int, grid: int, alpha: float) -> int:
 def grid_size(alpha: float, tolerance: float) -> int:
     """Nodes a face edge that a lobe of roughness α needs for a p99 texel error ≤ tolerance, a multiple of 8."""
     finer = (1e-3 / tolerance) ** (1 / ORDER)
-    n = max(SHARP / max(alpha, 1e-9) + MARGIN, FLOOR + KINK * alpha) * finer
+    n = max((SHARP / max(alpha, 1e-9) + MARGIN) * finer, FLOOR * finer + KINK * alpha * finer**2)
     return min(max(8 * math.ceil(n / 8), 8), LARGEST_GRID)
 
 
 KINK_ERROR = 0.021
 """Error of midpoints over texels of 1 radian across the kink of (n·l)₊, on the hardest image measured."""
+
+SHARP_ENOUGH = 0.05
+"""Lobes up to this α carry less than a hundredth of their weight near the horizon."""
 
 
 def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0) -> int:
@@ -86,14 +95,15 @@ def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0) -
 
     Midpoints (1) leave 1.3e-3·(texel/α/.34)² (measured: 1.3e-3 at .34); pairs of Gauss points in m cells an
     edge leave about 1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this bounds by its fourth power. The
-    kink of (n·l)₊ costs a texel with `share` of all energy share·texel/(8 cuts²) where it sets, and midpoints
-    KINK_ERROR·texel on a whole image, which a certificate with midpoints adds to its statement.
+    kink of (n·l)₊ costs a texel with `share` of all energy share·texel/(8 cuts²) where it sets, and a whole
+    image KINK_ERROR·texel/cuts², which a certificate adds to its statement.
     """
     x = texel / alpha / 0.34
     kink = math.sqrt(2.5 * share * texel / tolerance)
-    if 1.3e-3 * x * x <= tolerance / 20 and kink <= 1 and KINK_ERROR * texel <= tolerance / 7:
+    horizon = math.sqrt(7 * KINK_ERROR * texel / tolerance) if alpha > SHARP_ENOUGH else 0.0
+    if 1.3e-3 * x * x <= tolerance / 20 and kink <= 1 and horizon <= 1:
         return 1
-    cells = max(x * (5e-4 / tolerance) ** 0.25, kink / 2)
+    cells = max(x * (5e-4 / tolerance) ** 0.25, kink / 2, horizon / 2)
     return 2 * min(max(1, math.ceil(cells)), 512)
 
 

@@ -204,8 +204,10 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
         hits = lines / np.stack([cosine, cosine, sine, sine])
         enter_x, enter_z = np.where(cosine > 0, 0, 1), np.where(sine > 0, 2, 3)
         n = np.arange(len(own))
-        enter = np.where(hits[enter_x, n] > hits[enter_z, n], enter_x, enter_z)
-        leave = np.where(hits[1 - enter_x, n] < hits[5 - enter_z, n], 1 - enter_x, 5 - enter_z)
+        # Along an axis the ray never meets the sides parallel to it.
+        enter = np.where((sine == 0) | (hits[enter_x, n] > hits[enter_z, n]) & (cosine != 0), enter_x, enter_z)
+        leave = np.where((sine == 0) | (hits[1 - enter_x, n] < hits[5 - enter_z, n]) & (cosine != 0), 1 - enter_x,
+                         5 - enter_z)
         pole = on & ~(hits[enter, n] > 0)
         inverse_in, inverse_out = 1 / lines[enter, n], 1 / lines[leave, n]
     # A breakpoint rounded past an axis leaves a piece of 1e-16 rad where no side is left: no weight.
