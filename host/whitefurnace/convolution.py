@@ -162,19 +162,18 @@ class Convolver:
         self.latlong = e.kind == "latlong"
         self.rows, self.columns = e.texels.shape[-3:-1]
         self.faces = 1 if self.latlong else 6
-        omega = (np.repeat(latlong_solid_angles(self.rows, self.columns)[:, None], self.columns, 1) if self.latlong
-                 else np.broadcast_to(cube_solid_angles(self.rows), (6, self.rows, self.columns)))
-        self._mean = np.tensordot(omega, e.texels, omega.ndim) / (4 * math.pi)
+        self._mean = np.array(e.statistics["mean"])
         mean = float(self._mean.mean())
         self.scale = 2.0 ** -round(math.log2(mean)) if mean > 0 and math.isfinite(mean) else 1.0
         texels = device.aligned_empty(e.texels.shape, np.float32)
         np.multiply(e.texels, np.float32(self.scale), out=texels)
-        self.constant = not np.ptp(texels.reshape(-1, 3), axis=0).any()
+        self.constant = bool((texels == texels[(0,) * (texels.ndim - 1)]).all())
         self.texel = math.pi / self.rows if self.latlong else math.pi / 2 / self.rows
-        self._omega = omega
         self._texels = texels
         self._radiance = device.array(texels)
-        self._clipped, self._bright = self._extract(texels, omega)
+        self._bright_shares = np.empty(0)
+        self._bright_cache: dict[tuple[int, int, int], Buffer] = {}
+        self._clipped, self._bright = self._extract(texels)
         self._texel_program = source.texels(e.kind)
         self._tables: dict[int, tuple[Buffer, Buffer]] = {}
         self._grids: dict[int, Buffer] = {}
@@ -188,27 +187,35 @@ class Convolver:
 
     # ------------------------------------------------------------------------------------------- sources
 
-    def _extract(self, texels: np.ndarray, omega: np.ndarray) -> tuple[Buffer, tuple[np.ndarray, np.ndarray]]:
+    def _extract(self, texels: np.ndarray) -> tuple[Buffer, tuple[np.ndarray, np.ndarray]]:
         """Clips the BRIGHT texels of largest radiance × solid angle to the least of them.
 
         Gives the clipped texels and the (indices, excess radiance) taken; a sun then leaves neither a firefly
-        nor a hole, since its excess is summed exactly for each output.
+        nor a hole, since its excess is summed exactly for each output. A small image has few bright texels: their
+        nodes, many a texel, would cost more than the grid.
         """
-        energy = texels.sum(-1) * omega.astype(np.float32)
+        omega = (latlong_solid_angles(self.rows, self.columns)[:, None] if self.latlong
+                 else cube_solid_angles(self.rows)).astype(np.float32)
+        energy = texels.sum(-1)
+        energy *= omega
         flat = energy.ravel()
-        count = min(planning.BRIGHT, flat.size)
+        total = float(flat.sum(dtype=np.float64))
+        count = min(planning.BRIGHT, max(flat.size // 32, 2 if flat.size >= 8 else 0))
+        clipped = self.device.aligned_empty((flat.size, 3), np.float32)
+        clipped[:] = texels.reshape(-1, 3)
+        if count == 0:
+            self.share = float(flat.max()) / total if total > 0 else 0.0
+            return self.device.array(clipped), (np.arange(0), np.empty((0, 3)))
         index = np.argpartition(flat, flat.size - count)[flat.size - count:]
         index = index[np.argsort(-flat[index], kind="stable")]
         level = flat[index].min()
         keep = np.divide(level, flat[index], out=np.ones(count, np.float32), where=flat[index] > 0)
-        clipped = texels.reshape(-1, 3).copy()
         original = clipped[index]
         clipped[index] = original * keep[:, None]
         excess = original.astype(np.float64) - clipped[index]  # exact, so that no energy is lost to rounding
         real = excess.any(1)
-        total = float(energy.sum(dtype=np.float64))
         self.share = float(level) / total if total > 0 else 0.0
-        self.bright_share = float(flat[index[0]]) / total if total > 0 else 0.0
+        self._bright_shares = flat[index[real]] / total if total > 0 else np.empty(0)
         return self.device.array(clipped), (index[real], excess[real])
 
     def _table(self, cuts: int) -> tuple[Buffer, Buffer]:
@@ -273,19 +280,29 @@ class Convolver:
             self._grids[n] = listed
         return self._grids[n]
 
-    def _bright_list(self, cuts: int) -> Buffer | None:
-        """The excess of the bright texels as a list, each cut into cuts × cuts nodes."""
+    def _bright_lists(self, lobe: Lobe, tolerance: float, finer: int = 1) -> list[Buffer]:
+        """The excess of the bright texels as lists, texels of like share together: the more of the energy one
+        holds, the more nodes it takes (`finer` times as many an edge)."""
         index, excess = self._bright
         if not len(index):
-            return None
-        listed = self.device.empty((len(index) * cuts * cuts, 8), self.kind)
-        self._launch(self._texel_kernel("chosen_nodes"), len(index) * cuts * cuts,
-                     (listed, np.int32(len(index)), self.device.array(index.astype(np.int32)),
-                      self.device.array(excess.astype(self.kind)), *self._texel_arguments(cuts, self._clipped)))
-        return listed
-
-    def _bright_cuts(self, lobe: Lobe, tolerance: float) -> int:
-        return max(2, planning.cuts_for(self.texel, lobe.alpha, tolerance, self.bright_share))
+            return []
+        smooth = planning.cuts_for(self.texel, min(lobe.alpha, planning.SHARP_ENOUGH), tolerance)
+        wanted = np.array([max(smooth, planning.bright_cuts(self.texel, lobe.alpha, tolerance, share))
+                           for share in self._bright_shares])
+        lists = []
+        for cuts in np.unique(wanted):
+            group = np.flatnonzero(wanted == cuts)
+            c = int(cuts) * finer
+            key = (c, len(group), int(group[0]))
+            if key not in self._bright_cache:
+                listed = self.device.empty((len(group) * c * c, 8), self.kind)
+                self._launch(self._texel_kernel("chosen_nodes"), len(group) * c * c,
+                             (listed, np.int32(len(group)), self.device.array(index[group].astype(np.int32)),
+                              self.device.array(excess[group].astype(self.kind)),
+                              *self._texel_arguments(c, self._clipped)))
+                self._bright_cache[key] = listed
+            lists.append(self._bright_cache[key])
+        return lists
 
     def _bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
         """Every node of the clipped source, in bands: (list, nodes in it, share done)."""
@@ -324,7 +341,7 @@ class Convolver:
                  share: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
         """The level over all directions of `shape` from the n × n grid and the bright texels, (dims, 3)."""
         split = planning.split_for(n, lobe.alpha)
-        listed, bright = self._grid(n, lobe.alpha), self._bright_list(self._bright_cuts(lobe, tolerance))
+        listed, bright = self._grid(n, lobe.alpha), self._bright_lists(lobe, tolerance)
         far = self._grid(split.grid, lobe.alpha) if split else None
         blocks = self.device.array(_block_bounds(n).astype(self.kind)) if split else None
         group = self._step
@@ -351,9 +368,11 @@ class Convolver:
             else:
                 splits = self._partials(lobe, listed, count, block, partial, 0)
             bright_splits, extra = 0, partial
-            if bright is not None:
-                extra = self.device.empty((-(-bright.shape[0] // planning.CHUNK), 4, padded), self.kind)
-                bright_splits = self._partials(lobe, bright, bright.shape[0], block, extra, 0)
+            if bright:
+                chunks = sum(-(-part.shape[0] // planning.CHUNK) for part in bright)
+                extra = self.device.empty((chunks, 4, padded), self.kind)
+                for some in bright:
+                    bright_splits += self._partials(lobe, some, some.shape[0], block, extra, bright_splits)
             level = self.device.empty((3, padded), self.kind)
             self.device.launch(self._program(lobe).kernel("finish"), (padded // self.device.lanes(self.precision),),
                                (level, np.int32(padded), partial, np.int32(splits), extra, np.int32(bright_splits),
@@ -365,7 +384,7 @@ class Convolver:
     def exact(self, wanted: Sequence[tuple[Lobe, np.ndarray]], cuts: int, tolerance: float = 1e-3) -> list[np.ndarray]:
         """For each (lobe, directions (3, m)): the integral over every texel, (m, 3) float64, in one pass.
 
-        Bright texels are cut twice as fine as `convolve` cuts them. The spherical harmonics of the same nodes
+        Bright texels are cut twice as fine as in `convolve`. The spherical harmonics of the same nodes
         are kept for `harmonics`.
         """
         jobs = []
@@ -380,16 +399,13 @@ class Convolver:
             for lobe, directions_on, sums in jobs:
                 sums += self._list_sums(lobe, listed, count, directions_on)
         results = []
-        fine = 2 * max((self._bright_cuts(lobe, tolerance) for lobe, _ in wanted), default=2)
-        bright = self._bright_list(fine)
-        if bright is not None:
-            extra = self._harmonic_sums(bright, bright.shape[0])
-            coefficients[:27] += extra[:27]
         for (_, directions), (lobe, directions_on, sums) in zip(wanted, jobs, strict=True):
             value = sums[:3] / sums[3]
-            if bright is not None:
-                value += self._list_sums(lobe, bright, bright.shape[0], directions_on)[:3] / lobe.norm
+            for listed in self._bright_lists(lobe, tolerance, finer=2):
+                value += self._list_sums(lobe, listed, listed.shape[0], directions_on)[:3] / lobe.norm
             results.append(value.T[:directions.shape[1]])
+        for listed in self._bright_lists(COSINE, 1e-3):
+            coefficients[:27] += self._harmonic_sums(listed, listed.shape[0])[:27]
         self._harmonics[cuts] = coefficients
         return results
 

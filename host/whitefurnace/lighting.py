@@ -14,7 +14,7 @@ from whitefurnace import plan as planning
 from whitefurnace.catalogue import Model
 from whitefurnace.convolution import COSINE, ROUNDING, Convolver, Level, Lobe, Progress, Shape, ndf_lobe, statement
 from whitefurnace.device import Device, choose_device
-from whitefurnace.environments import Environment, environment
+from whitefurnace.environments import Environment, cube_solid_angles, environment, latlong_solid_angles
 from whitefurnace.errors import CheckError, UsageError
 from whitefurnace.plan import LevelPlan
 from whitefurnace.recipe import IRRADIANCE_SIZE, Chain, chain, tolerance_of
@@ -130,8 +130,8 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
             finer = planning.refined(job.plan) if job.lobe else None
             stuck = stuck + 1 if level.error > 0.9 * before else 0
             if finer is None or stuck == 2:
-                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g}, over the "
-                                 f"tolerance {tolerance:g}, and a finer grid does not lower it")
+                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g}, over "
+                                 f"the tolerance {tolerance:g}, and a finer grid does not lower it")
             job, before = replace(job, plan=finer), level.error
             begin = time.perf_counter()
             again = _make(convolver, job, tolerance, (0.8, 0.8))
@@ -217,12 +217,21 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
     wide_coverage: tuple[np.ndarray, ...] = ()
     if env.coverage is not None:
         grey = np.repeat(env.coverage[..., None], 3, -1)
-        alpha = light(device, replace(env, texels=grey, coverage=None, statistics={}), recipe, latlong=latlong,
-                      seed=seed, progress=progress)
+        mean = float(np.average(env.coverage, weights=_source_weights(env)))
+        as_light = replace(env, texels=grey, coverage=None, statistics={"mean": [mean] * 3})
+        alpha = light(device, as_light, recipe, latlong=latlong, seed=seed, progress=progress)
         coverage = tuple(level.texels[..., 0] for level in alpha.levels)
         wide_coverage = tuple(level.texels[..., 0] for level in alpha.latlongs)
     return Lighting(tuple(levels[:len(jobs)]), tuple(levels[len(jobs):-1]), levels[-1], sh, sh_error, kept, coverage,
                     wide_coverage, time.perf_counter() - begin)
+
+
+def _source_weights(env: Environment) -> np.ndarray:
+    """Solid angles of the source's texels, in the shape of its coverage."""
+    assert env.coverage is not None
+    if env.kind == "latlong":
+        return np.broadcast_to(latlong_solid_angles(*env.coverage.shape)[:, None], env.coverage.shape)
+    return np.broadcast_to(cube_solid_angles(env.coverage.shape[1]), env.coverage.shape)
 
 
 def _energy(texels: np.ndarray) -> float:
