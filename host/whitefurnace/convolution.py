@@ -146,7 +146,8 @@ class Convolver:
     """The state of one environment on one device: texels, source grids, compiled kernels.
 
     Radiance is scaled by a power of two to a mean near 1, which is exact and keeps sums of very bright or very
-    dark images inside float32; results are scaled back.
+    dark images inside float32; results are scaled back. Lobes integrate what lies above the least radiance of
+    each channel, and that base is added after: its share needs no sum, and a constant image comes out exactly.
     """
 
     def __init__(self, device: Device, environment: Environment, *, precision: int = 32, seed: str = "",
@@ -173,6 +174,7 @@ class Convolver:
         self._radiance = device.array(texels)
         self._bright_shares = np.empty(0)
         self._bright_cache: dict[tuple[int, int, int], Buffer] = {}
+        self.base = texels.reshape(-1, 3).min(0)
         self._clipped, self._bright = self._extract(texels)
         self._texel_program = source.texels(e.kind)
         self._tables: dict[int, tuple[Buffer, Buffer]] = {}
@@ -196,13 +198,11 @@ class Convolver:
         """
         omega = (latlong_solid_angles(self.rows, self.columns)[:, None] if self.latlong
                  else cube_solid_angles(self.rows)).astype(np.float32)
-        energy = texels.sum(-1)
-        energy *= omega
-        flat = energy.ravel()
+        clipped = self.device.aligned_empty((texels.size // 3, 3), np.float32)
+        np.subtract(texels.reshape(-1, 3), self.base, out=clipped)
+        flat = (clipped.sum(-1).reshape(texels.shape[:-1]) * omega).ravel()
         total = float(flat.sum(dtype=np.float64))
         count = min(planning.BRIGHT, max(flat.size // 32, 2 if flat.size >= 8 else 0))
-        clipped = self.device.aligned_empty((flat.size, 3), np.float32)
-        clipped[:] = texels.reshape(-1, 3)
         if count == 0:
             self.share = float(flat.max()) / total if total > 0 else 0.0
             return self.device.array(clipped), (np.arange(0), np.empty((0, 3)))
@@ -377,7 +377,7 @@ class Convolver:
             self.device.launch(self._program(lobe).kernel("finish"), (padded // self.device.lanes(self.precision),),
                                (level, np.int32(padded), partial, np.int32(splits), extra, np.int32(bright_splits),
                                 self.real(1 / lobe.norm)))
-            out[index] = level.read().T[:len(index)]
+            out[index] = level.read().T[:len(index)] + self.base
             self.progress(lobe.name, share[0] + (share[1] - share[0]) * (begin + len(index)) / shape.count)
         return out.reshape(*shape.dims, 3)
 
@@ -403,9 +403,10 @@ class Convolver:
             value = sums[:3] / sums[3]
             for listed in self._bright_lists(lobe, tolerance, finer=2):
                 value += self._list_sums(lobe, listed, listed.shape[0], directions_on)[:3] / lobe.norm
-            results.append(value.T[:directions.shape[1]])
+            results.append(value.T[:directions.shape[1]] + self.base)
         for listed in self._bright_lists(COSINE, 1e-3):
             coefficients[:27] += self._harmonic_sums(listed, listed.shape[0])[:27]
+        coefficients[:3] += self.base * 2 * math.sqrt(math.pi)  # ∫ Y00 dω
         self._harmonics[cuts] = coefficients
         return results
 

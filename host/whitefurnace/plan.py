@@ -26,7 +26,7 @@ NODES_A_BAND = 1 << 18
 # sharp term follows the lobe's width, the floor the kink of (n·l)₊ at the horizon, which rough lobes carry to
 # full height. The error falls like n^-ORDER, so other tolerances scale n by (1e-3/tolerance)^(1/ORDER); at
 # the kink like n^-2.
-SHARP, MARGIN, FLOOR, KINK = 3.2, 12, 28, 44
+SHARP, MARGIN, FLOOR, KINK = 3.5, 12, 28, 44
 LARGEST_GRID = 2048
 GROWTH = 1.5
 """How much finer the grid of a level becomes when its certificate misses the tolerance: 1.5^4 ≈ 5 in error."""
