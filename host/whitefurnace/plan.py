@@ -128,7 +128,7 @@ class Split:
     grid: int
 
 
-NEAR_ANGLE, FAR_NODES = 0.6, 28.0
+NEAR_ANGLE, FAR_NODES = 0.62, 28.0
 """Where the near part of a lobe of 192 nodes ends, radians, and nodes × that angle of the far grid, for 1e-3:
 measured to leave the error as it is at a quarter of the time."""
 
