@@ -750,7 +750,7 @@ def test_a_constant_is_constant(tmp_path, pixels):
     # The manifest states the error over L00.
     np.testing.assert_allclose(arrays["sh"], want, rtol=0, atol=done.manifest["sh"]["error"] * want[0, 0])
     assert done.manifest["sh"]["error"] <= 1e-5
-    # A constant has no error but float32's, for which the statement always keeps a little: a twentieth of the tolerance.
+    # A constant has no error but float32's, for which the statement keeps a twentieth of the tolerance at most.
     assert max(arrays["worst"]) <= 5e-5
     assert done.manifest["source"]["statistics"]["max_over_mean"] == pytest.approx(1)
 

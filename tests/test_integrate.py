@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -86,19 +87,20 @@ def smith_area(names: Mapping[str, str], arguments: Mapping[str, np.ndarray],
     entry = models("ndf")[names["ndf"]]
     if "lambda" not in entry.reference:
         return None
+    NoV = arguments["NoV"]
     with np.errstate(divide="ignore"):  # a = cot θ/α is infinite at normal incidence
-        return everywhere(arguments["NoV"] * (1 + entry.reference["lambda"](arguments["NoV"], **of_slot(arguments, "ndf"))))
+        return everywhere(NoV * (1 + entry.reference["lambda"](NoV, **of_slot(arguments, "ndf"))))
 
 
 def over_lights(names: Mapping[str, str], arguments: Mapping[str, np.ndarray],
-                fresnel: Callable[[np.ndarray, int], np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
+                fresnel: Callable[[int, np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
     """Quadrature over light directions, where it is good to 1e-7: n·v ≥ .3 and lobes of .2 and wider."""
     ndf = models("ndf")[names["ndf"]]
     if "lambda" not in ndf.reference or "alpha" not in of_slot(arguments, "ndf"):
         return None
     masking = models("masking")[names["masking"]].reference["G"]
     index, values = [], []
-    for k in np.flatnonzero((arguments["NoV"] >= 0.3) & (arguments["ndf_alpha"] >= 0.2)):
+    for k in map(int, np.flatnonzero((arguments["NoV"] >= 0.3) & (arguments["ndf_alpha"] >= 0.2))):
         own = {name: v[k] for name, v in of_slot(arguments, "ndf").items()}
 
         def G(v: np.ndarray, light: np.ndarray, own: dict[str, Any] = own) -> np.ndarray:
@@ -106,21 +108,20 @@ def over_lights(names: Mapping[str, str], arguments: Mapping[str, np.ndarray],
                 return masking(ndf.reference["lambda"](v, **own), ndf.reference["lambda"](light, **own))
 
         index.append(k)
-        values.append(reference.albedo_over_lights(
-            lambda c, own=own: ndf.reference["D"](c, **own), G,
-            lambda c, k=k: fresnel(c, k), float(arguments["NoV"][k]), float(own["alpha"])))
+        values.append(reference.albedo_over_lights(partial(ndf.reference["D"], **own), G, partial(fresnel, k),
+                                                   float(arguments["NoV"][k]), float(own["alpha"])))
     return np.array(index), np.array(values)
 
 
 def albedo(names: Mapping[str, str], arguments: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
     model = models("fresnel")[names["fresnel"]]
     own = of_slot(arguments, "fresnel")
-    return over_lights(names, arguments, lambda c, k: model.reference["F"](c, **{n: v[k] for n, v in own.items()}))
+    return over_lights(names, arguments, lambda k, c: model.reference["F"](c, **{n: v[k] for n, v in own.items()}))
 
 
 def split_sum(names: Mapping[str, str], arguments: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray] | None:
     parts = [over_lights(names, arguments, f) for f in
-             (lambda c, k: 1 - (1 - c) ** 5, lambda c, k: (1 - c) ** 5)]
+             (lambda k, c: 1 - (1 - c) ** 5, lambda k, c: (1 - c) ** 5)]
     if parts[0] is None or parts[1] is None:
         return None
     return parts[0][0], np.stack([parts[0][1], parts[1][1]], -1)
@@ -154,9 +155,24 @@ def test_integrals(device: Device, name: str, names: dict[str, str], precision: 
     context = f"{name} {names} at {cell}: got {got.values[index][at]}, wanted {want[at]}, stated {got.error:.1e}"
     slack = TRUTH_ERROR.get(name, 0.0)
     assert error.max() <= got.error + slack, context
-    # The default tolerance of the design, with float32's 2e-6 of values up to 1 that the statement includes.
-    assert error.max() <= (4e-6 if precision == 32 else 1e-12 if slack == 0 else slack), context
+    # The default tolerance of the design with float32's 2e-6 of values up to 1. In float64 the design's 1e-12 is met
+    # away from the ends; where n·v and α are both 1e-4 the ladder ends at 1e-9, and says so.
+    assert error.max() <= (4e-6 if precision == 32 else 1e-9 if slack == 0 else slack), context
     assert got.evaluations > 0 and got.seconds > 0 and got.rule.startswith("gauss-")
+
+
+@pytest.mark.parametrize("name", ["normalization", "weak_furnace", "projected_area"])
+def test_float64_reaches_its_tolerance(device: Device, name: str) -> None:
+    if not device.fp64:
+        pytest.skip("no float64")
+    NoV, alpha = (a.ravel() for a in np.meshgrid([0.05, 0.2, 0.5, 0.9, 1.0], [0.05, 0.2, 0.3, 0.5, 1.0]))
+    view: dict[str, Any] = {"NoV": NoV} if INTEGRALS[name].view else {}
+    got = integrate(name, ndf="ggx", alpha=alpha, precision=64, device=device, **view)
+    known = TRUTHS[name]({"ndf": "ggx", "masking": "smith"}, {**view, "ndf_alpha": alpha})
+    assert known is not None
+    error = float(np.abs(got.values - known[1]).max())
+    # The design's default for float64.
+    assert error <= got.error <= 1.1e-12, (name, error, got.error, got.rule)
 
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-3, 1e-4, 1e-5, 1e-6])
@@ -195,7 +211,7 @@ def test_ggx_against_the_azimuth_in_closed_form(device: Device, precision: int) 
         assert error[k] <= tolerance, (NoV[k], alpha[k], got[k], want[k], error[k])
     # Schlick's F of the albedo, on the same nodes, puts the pair together: F0 A + F90 B.
     schlick = integrate("albedo", **kwargs, fresnel="schlick:f90=.9", f0=0.04).values
-    together = 0.04 * pairs.values[:, 0] + (0.04 * 0 + 0.9) * pairs.values[:, 1]
+    together = 0.04 * pairs.values[:, 0] + 0.9 * pairs.values[:, 1]
     assert np.abs(schlick - together).max() <= tolerance
 
 
@@ -245,7 +261,8 @@ def evaluate(device: Device, slots: Mapping[str, Model], call: str, columns: lis
 
 
 # Angles with both ends thicker: 1e-5 … 1e-2, the middle, and as near to π/2.
-ANGLES = np.concatenate([np.geomspace(1e-5, 0.1, 25), np.linspace(0.1, 1.47, 25), math.pi / 2 - np.geomspace(0.1, 1e-3, 15)])
+ANGLES = np.concatenate([np.geomspace(1e-5, 0.1, 25), np.linspace(0.1, 1.47, 25),
+                         math.pi / 2 - np.geomspace(0.1, 1e-3, 15)])
 
 
 def grid(entry: Model, *axes: np.ndarray) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
@@ -256,12 +273,12 @@ def grid(entry: Model, *axes: np.ndarray) -> tuple[list[np.ndarray], dict[str, n
 
 
 def check_piece(got: np.ndarray, wanted: Callable[[np.ndarray], np.ndarray], x: np.ndarray, precision: int,
-                context: str, ulps: float = 8) -> None:
-    """Within `ulps` roundings and what the reference itself changes by when its cosine x is rounded."""
+                context: str, ulps: float = 8, floor: float = 0.0) -> None:
+    """Within `ulps` roundings, `floor` and what the reference itself changes by when its cosine x is rounded."""
     with np.errstate(divide="ignore", over="ignore"):
         want = wanted(x)
         unsure = np.maximum(np.abs(wanted(x * (1 + 2**-52)) - want), np.abs(wanted(x * (1 - 2**-52)) - want))
-    tolerance = ulps * (2**-24 if precision == 32 else 2**-53) * np.abs(want) + 4 * unsure
+    tolerance = ulps * (2**-24 if precision == 32 else 2**-53) * np.abs(want) + 4 * unsure + floor
     finite = np.isfinite(want) & (np.abs(want) < (1e37 if precision == 32 else 1e300))
     bad = finite & ~(np.abs(got - want) <= tolerance)
     k = int(np.argmax(np.where(finite, np.abs(got - want) / np.maximum(tolerance, 1e-300), 0)))
@@ -291,8 +308,10 @@ def test_ndf_pieces(device: Device, name: str, precision: int) -> None:
         cosine = np.cos(angle).astype(kind).astype(np.float64)
         got = evaluate(device, {"ndf": entry}, "NDF_LAMBDA(cosine)", [cosine, *columns], precision, ["cosine"])
         inside = cosine < 1
-        check_piece(got[inside], lambda c: entry.reference["lambda"](c, **{k: v[inside] for k, v in parameters.items()}),
-                    cosine[inside], precision, f"{name} Λ")
+        own = {k: v[inside] for k, v in parameters.items()}
+        # A reference may be a difference from 1, as (√(1 + x) - 1)/2 is: two of its roundings, absolute.
+        check_piece(got[inside], lambda c: entry.reference["lambda"](c, **own), cosine[inside], precision,
+                    f"{name} Λ", floor=2**-52)
         assert (got[~inside] == 0).all(), f"{name}: Λ is 0 at normal incidence"
 
 
@@ -332,7 +351,8 @@ def test_fresnel_pieces(device: Device, name: str, precision: int) -> None:
         pytest.skip("no float64")
     entry = models("fresnel")[name]
     (cosine,), parameters = grid(entry, np.cos(ANGLES))
-    got = evaluate(device, {"fresnel": entry}, "FRESNEL_F(cosine)", [cosine, *parameters.values()], precision, ["cosine"])
+    columns = [cosine, *parameters.values()]
+    got = evaluate(device, {"fresnel": entry}, "FRESNEL_F(cosine)", columns, precision, ["cosine"])
     want = entry.reference["F"](cosine, **parameters)
     # Absolute: F is a sum of two parts of size 1 at most, (1 - c)⁵ five roundings.
     assert np.abs(got - want).max() <= (4e-7 if precision == 32 else 1e-15)
@@ -358,7 +378,7 @@ def test_precision(device: Device) -> None:
     assert integrate("weak_furnace", ndf="ggx", NoV=0.5, alpha=0.3, device=device).values.dtype == np.float32
     if device.fp64:
         fine = integrate("weak_furnace", ndf="ggx", NoV=0.5, alpha=0.3, precision=64, device=device)
-        assert fine.values.dtype == np.float64 and abs(float(fine.values) - 1) <= 1e-12  # the default tolerance
+        assert fine.values.dtype == np.float64 and abs(float(fine.values) - 1) <= fine.error
 
 
 def test_work_is_counted(device: Device) -> None:
@@ -395,7 +415,7 @@ def test_work_is_counted(device: Device) -> None:
     ({"name": "albedo", "ndf": "ggx", "NoV": 0.5, "alpha": 0.3, "tolerance": math.nan}, "tolerance"),
 ], ids=lambda value: value if isinstance(value, str) else None)
 def test_bad_arguments(device: Device, kwargs: dict[str, Any], expected: str) -> None:
-    with pytest.raises(UsageError, match=".") as caught:
+    with pytest.raises(UsageError) as caught:
         integrate(**kwargs, device=device)
     assert expected in str(caught.value) and "\n" not in str(caught.value), caught.value
 

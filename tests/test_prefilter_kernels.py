@@ -16,7 +16,7 @@ from whitefurnace.device import Device, choose_device
 from whitefurnace.environments import environment
 from whitefurnace.recipe import chosen
 
-EIGHT = Shape(False, 8)
+WHERE = Shape(False, 4)
 
 
 def ggx(alpha: float) -> Lobe:
@@ -29,17 +29,17 @@ def noise(*shape: int) -> np.ndarray:
 
 
 def convolved(device: Device, texels: np.ndarray, lobe: Lobe, n: int, rotate: float = 0.0,
-              shape: Shape = EIGHT, tolerance: float = 1e-5) -> np.ndarray:
+              shape: Shape = WHERE, tolerance: float = 1e-5) -> np.ndarray:
     convolver = Convolver(device, environment(texels, rotate=rotate))
     return convolver.convolve(lobe, shape, n, tolerance).reshape(-1, 3) / convolver.scale
 
 
 def exact(device: Device, texels: np.ndarray, lobe: Lobe, cuts: int, rotate: float = 0.0) -> np.ndarray:
     convolver = Convolver(device, environment(texels, rotate=rotate))
-    return convolver.exact([(lobe, EIGHT.directions())], cuts, 1e-5)[0] / convolver.scale
+    return convolver.exact([(lobe, WHERE.directions())], cuts, 1e-5)[0] / convolver.scale
 
 
-def truth(texels: np.ndarray, alpha: float, cuts: int, rotate: float = 0.0, shape: Shape = EIGHT) -> np.ndarray:
+def truth(texels: np.ndarray, alpha: float, cuts: int, rotate: float = 0.0, shape: Shape = WHERE) -> np.ndarray:
     return reference.exact_lobe(texels, math.radians(rotate), shape.directions().T, reference.ggx_lobe(alpha), cuts)
 
 
@@ -77,12 +77,11 @@ def test_anterpolation_has_its_order(device: Device, source: tuple[int, ...], al
 def test_planned_grids_reach_their_tolerance(device: Device, source: tuple[int, ...], alpha: float) -> None:
     """Small and odd sources, with a rotation, on the grid that the plan takes for 1e-3 (split in two for .03)."""
     texels = noise(*source)
-    shape = Shape(False, 4)
     size = source[1] if len(source) == 3 else source[0]
     # Cells of half the lobe's width and of a 64th of a hemisphere, for its kink: Gauss nodes then leave 1e-5.
     cuts = max(4, math.ceil(2 * math.pi / size / max(alpha, 0.04)), math.ceil(64 / size))
-    want = truth(texels, alpha, cuts, 33.0, shape)
-    got = convolved(device, texels, ggx(alpha), plan.grid_size(alpha, 1e-3), 33.0, shape)
+    want = truth(texels, alpha, cuts, 33.0)
+    got = convolved(device, texels, ggx(alpha), plan.grid_size(alpha, 1e-3), 33.0)
     error = np.abs(got / want - 1).max(1)
     # The plan promises 1e-3 at the 99th percentile; noise from texel to texel is harder than any image.
     assert np.percentile(error, 99) <= 1.5e-3, (source, alpha, np.percentile(error, 99), error.max())
@@ -113,7 +112,7 @@ def test_exact_sum(device: Device, source: tuple[int, ...], alpha: float, rotate
 @pytest.mark.parametrize("source", [(32, 64), (6, 16, 16)], ids=str)
 def test_irradiance(device: Device, source: tuple[int, ...]) -> None:
     texels = noise(*source)
-    want = reference.exact_lobe(texels, 0.4, EIGHT.directions().T, reference.cosine_lobe, 8)
+    want = reference.exact_lobe(texels, 0.4, WHERE.directions().T, reference.cosine_lobe, 8)
     degrees = math.degrees(0.4)
     assert_close(exact(device, texels, COSINE, 8, degrees), want, rounding(1.0) + 2e-5, source)  # kink: texel/8 cells
     assert_close(convolved(device, texels, COSINE, plan.grid_size(1.0, 1e-4), degrees), want, 1e-4, source)
@@ -123,7 +122,7 @@ def test_irradiance_of_a_hemisphere(device: Device) -> None:
     """Sky of 1 over a black ground: E/π = (1 + n·y)/2, in closed form."""
     texels = np.zeros((16, 32, 3), np.float32)
     texels[:8] = 1
-    d = EIGHT.directions()
+    d = WHERE.directions()
     got = exact(device, texels, COSINE, 16)
     # Nodes of π/256 across the kink of (n·l)₊: (π/256)²/8 of its length of one row at most.
     assert np.abs(got - (1 + d[1][:, None]) / 2).max() <= 5e-5
@@ -185,7 +184,7 @@ def test_one_bright_texel_is_the_lobe(device: Device, source: tuple[int, ...], a
     texels[at] = (1e4, 2e4, 5e3)
     d, weight, index = reference.texel_nodes(texels, 0.3, 24)
     own = index == np.ravel_multi_index(at, source)
-    s = np.maximum(1 - EIGHT.directions().T @ d[own].T, 0)
+    s = np.maximum(1 - WHERE.directions().T @ d[own].T, 0)
     K = reference.ggx_lobe(alpha)(s) @ weight[own]
     want = (K * alpha**2 / math.pi / reference.ggx_lobe_norm(alpha))[:, None] * texels[at]
     got = convolved(device, texels, ggx(alpha), plan.grid_size(alpha, 1e-3), math.degrees(0.3), tolerance=1e-4)

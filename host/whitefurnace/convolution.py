@@ -634,21 +634,22 @@ def _coarsening(fine: int, coarse: int, kind: str) -> tuple[np.ndarray, np.ndarr
     return matrix.astype(kind), first.astype(np.int32), last.astype(np.int32)
 
 
-def statement(values: np.ndarray, reference: np.ndarray, uniform: int, solid_angle: np.ndarray,
-              mean: float, total: int) -> tuple[float, float, float]:
+def statement(values: np.ndarray, reference: np.ndarray, sample: tuple[np.ndarray, np.ndarray],
+              solid_angle: np.ndarray, mean: float, total: int) -> tuple[float, float, float]:
     """(error, worst, rmse) of a level from its sample.
 
-    values, reference: (m, 3), the uniform draw first, then the stratum. solid_angle: (m,). A texel's error is
-    max over channels of |x - ref| / max(ref, 1e-3 · mean), 0/0 = 0. The uniform texels stand for the rest of
-    the level by inverse probability in `rmse`; the stratum for itself.
+    sample: texel indices, a uniform draw and a stratum. values, reference: (m, 3) and solid_angle: (m,) of the
+    two in this order. A texel's error is max over channels of |x - ref| / max(ref, 1e-3 · mean), 0/0 = 0. In
+    `rmse` the stratum stands for itself and the uniform texels outside it, by inverse probability, for the rest.
     """
     reference = reference.astype(np.float64)
     difference = np.abs(values - reference)
     floor = np.maximum(reference, 1e-3 * mean)
     errors = np.divide(difference, floor, out=np.zeros_like(difference), where=floor > 0).max(1)
     weight = solid_angle.copy()
-    stratum = len(values) - uniform
-    weight[:uniform] *= max(total - stratum, 0) / max(uniform, 1)
+    uniform = len(sample[0])
+    outside = ~np.isin(sample[0], sample[1])
+    weight[:uniform] *= outside * (total - len(sample[1])) / max(int(outside.sum()), 1)
     energy = float((weight[:, None] * reference**2).sum())
     rmse = math.sqrt(float((weight[:, None] * difference**2).sum()) / energy) if energy > 0 else 0.0
     return float(errors[:uniform].max()), float(errors.max()), rmse

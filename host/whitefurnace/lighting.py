@@ -169,7 +169,7 @@ def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np
     solid = job.shape.solid_angles()
     flat = texels.reshape(-1, 3)
     mean = float((flat * solid[:, None]).sum() / (3 * solid.sum()))
-    error, worst, rmse = statement(flat[index], reference, len(sample[0]), solid[index], mean, job.shape.count)
+    error, worst, rmse = statement(flat[index], reference, sample, solid[index], mean, job.shape.count)
     # A mean over texels is made and checked in float64, and rounded once; elsewhere rounding has its own part.
     rounding = 0.0 if mean == 0 else ROUNDING[64 if job.lobe is None else convolver.precision]
     if mean > 0 and job.lobe and job.lobe.alpha > planning.SHARP_ENOUGH and not convolver.constant:

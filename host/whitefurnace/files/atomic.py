@@ -19,6 +19,7 @@ class Transaction:
 
     def __init__(self) -> None:
         self._targets: list[Path] = []
+        self._renamed = False
 
     @staticmethod
     def staging(path: Path) -> Path:
@@ -48,6 +49,7 @@ class Transaction:
                 os.replace(self.staging(path), path)
             except OSError as error:
                 raise FileError(f"cannot write {path}: {error.strerror or error}") from error
+            self._renamed = True
             del self._targets[0]
 
     def __enter__(self) -> Transaction:
@@ -55,6 +57,8 @@ class Transaction:
 
     def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
                  trace: TracebackType | None) -> None:
+        if self._renamed:  # stopped between renames: the manifest still staged proves the renamed ones ours
+            return
         for path in self._targets:
             with contextlib.suppress(OSError):
                 self.staging(path).unlink()

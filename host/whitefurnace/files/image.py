@@ -118,7 +118,7 @@ def _read(path: Path, size: int, digest: str) -> Image:
     hints.attribute("oiio:UnassociatedAlpha", 1)
     try:
         source = oiio.ImageInput.open(str(path), hints)
-    except UnicodeError as error:
+    except (UnicodeError, TypeError) as error:  # a name that is not Unicode is no string to the binding
         raise FileError(f"cannot read {str(path)!r}: its name is not valid Unicode") from error
     complaint = _complaint(oiio)  # left there, it is printed at exit
     if source is None:

@@ -1,0 +1,94 @@
+"""The README is true: its commands run, its Python runs, its generated parts are what the program says."""
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from whitefurnace.environments import LAYOUTS
+from whitefurnace.files import write_exr
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text("utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", README, re.M | re.S)
+
+
+def commands() -> list[str]:
+    lines = [line.split("#")[0].strip() for block in blocks("sh") for line in block.splitlines()]
+    return [line for line in lines if line.startswith("whitefurnace ")]
+
+
+def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "whitefurnace", *arguments], cwd=cwd, capture_output=True, text=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Small images under the names that the README uses, all of them EXR whatever the name says."""
+    where = tmp_path_factory.mktemp("readme")
+    rng = np.random.default_rng(7)
+    for name in ("studio.hdr", "day.exr", "night.exr", "forest_1k.exr"):
+        write_exr(where / name, rng.random((16, 32, 3), np.float32))
+    return where
+
+
+def test_there_are_commands_to_test():
+    assert len(commands()) >= 5 and len(blocks("python")) == 1
+
+
+@pytest.mark.parametrize("command", commands())
+def test_a_command_of_the_readme_runs(command, folder):
+    arguments = shlex.split(command)[1:]
+    if {"--size", "--tolerance"} & set(arguments):  # long bakes: planned only
+        arguments.append("--dry-run")
+    done = run(*arguments, cwd=folder)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_python_of_the_readme_runs(folder):
+    done = subprocess.run([sys.executable, "-c", blocks("python")[0]], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    # GGX's albedo at α = .25 lies between .9 and 1 at these angles; the rule is named
+    assert "gauss-" in done.stdout
+
+
+def test_the_table_of_models_is_what_the_program_lists():
+    listed = run("models")
+    written = README.partition("<!-- models:")[2].partition("```\n")[2].partition("```")[0]
+    assert written.strip("\n") == listed.stdout.strip("\n")
+
+
+def test_the_table_of_layouts_names_every_layout():
+    table = README.partition("| layout | aspect |")[2].partition("\n\n")[0]
+    for layout in LAYOUTS:
+        assert f"| {layout.name} | {layout.columns}:{layout.rows} |" in table, layout.name
+
+
+def test_the_options_of_the_readme_exist():
+    told = run("bake", "--help").stdout
+    for option in set(re.findall(r"`(--[a-z-]+)", README)):
+        assert option in told, option
+
+
+def test_the_targets_of_the_readme_exist():
+    makefile = (ROOT / "Makefile").read_text("utf-8")
+    for target in set(re.findall(r"\bmake ([a-z-]+)", README)) - {"and"}:
+        assert re.search(rf"^{target}:", makefile, re.M), target
+
+
+def test_help_is_quick_to_import():
+    # numpy, OpenCL and the image library cost .1 to .3 s each: help needs none of them.
+    script = ("import sys\nfrom whitefurnace.cli import main\n"
+              "try: main(['bake', '--help'])\nexcept SystemExit: pass\n"
+              "heavy = {'numpy', 'pyopencl', 'OpenImageIO', 'rich'} & set(sys.modules)\n"
+              "sys.exit(f'imported {heavy}' if heavy else 0)")
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
