@@ -138,7 +138,7 @@ __kernel void mean_latlong(__global float *restrict level, const int height, con
 }
 
 // ---- a cube source on any grid: great-circle polygons, clipped ------------------------------------------
-#define MOST 48  // corners: an output polygon has at most 34, and each of the 8 clips can add one
+#define MOST 112  // corners: an output polygon has at most 98, and each of the 9 clips can add one
 
 // Keep the part of the polygon with p·n ≥ 0 (Sutherland-Hodgman; the planes hold the origin, so the edges of
 // the result are great circles again).

@@ -340,6 +340,8 @@ class Convolver:
     def convolve(self, lobe: Lobe, shape: Shape, n: int, tolerance: float,
                  share: tuple[float, float] = (0.0, 1.0)) -> np.ndarray:
         """The level over all directions of `shape` from the n × n grid and the bright texels, (dims, 3)."""
+        if n % 8:
+            raise ValueError(f"a grid of {n} nodes an edge is not a multiple of the blocks' 8")
         split = planning.split_for(n, lobe.alpha)
         listed, bright = self._grid(n, lobe.alpha), self._bright_lists(lobe, tolerance)
         far = self._grid(split.grid, lobe.alpha) if split else None
@@ -469,22 +471,18 @@ class Convolver:
 
     def _means_of_cube(self, program: Any, shape: Shape, real: Any) -> np.ndarray:
         turn = self.environment.rotation
-        level = self.device.empty((*shape.dims, 3), np.float32)
-        # Sagitta of a chord of a parallel against the texel's height: (Δφ/chords)²/8 : Δθ ≤ 1e-5.
-        chords = min(16, max(2, math.ceil(math.sqrt(math.pi / shape.size / 8 / 1e-5))))
+        # Sagitta of a chord of a parallel against the texel's height: (Δφ/chords)²/8 : Δθ ≤ 2e-6, where 48 do.
+        chords = min(48, max(2, math.ceil(math.sqrt(math.pi / shape.size / 8 / 2e-6))))
+        out = np.empty((shape.count, 3), np.float32)
         tile = 1 << 15
         for first in range(0, shape.count, tile):
             count = min(tile, shape.count - first)
-            # A sub-buffer per tile would need alignment; the kernel takes `first` and writes from 0.
             part = self.device.empty((count, 3), np.float32)
             self._launch(program.kernel("mean_cube"), count,
                          (part, np.int32(first), np.int32(count), np.int32(shape.size), np.int32(shape.latlong),
                           np.int32(chords), np.int32(self.rows), real(math.cos(turn)), real(math.sin(turn)),
                           self._radiance))
-            if first == 0:
-                out = np.empty((shape.count, 3), np.float32)
             out[first:first + count] = part.read()
-        del level
         return out.reshape(*shape.dims, 3)
 
     def _means_by_edges(self, program: Any, size: int, real: Any) -> np.ndarray:

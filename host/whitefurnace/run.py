@@ -104,7 +104,11 @@ def _cells(entry: Integral, slots: Mapping[str, Chosen],
     if entry.view:
         if "NoV" not in parameters:
             raise UsageError(f"integral {entry.name} needs NoV, the cosine of the view angle")
-        NoV = np.asarray(parameters.pop("NoV"), np.float64)
+        given = parameters.pop("NoV")
+        try:
+            NoV = np.asarray(given, np.float64)
+        except (TypeError, ValueError):
+            raise UsageError(f"NoV must be a number, not {given!r}") from None
         if not ((NoV >= NOV_RANGE[0]) & (NoV <= NOV_RANGE[1])).all():
             raise UsageError(f"NoV is outside [{NOV_RANGE[0]:g}, {NOV_RANGE[1]:g}] (cosine of the view angle)")
         columns.append(NoV)
