@@ -9,10 +9,10 @@
 #endif
 
 // Node (row i, column j) of faces × rows·cuts × columns·cuts, in order from `first`: the list `convolve` reads.
-__kernel void nodes(__global scalar *restrict list, const int first, const int count, TEXELS_PARAMETERS) {
+__kernel void nodes(__global scalar *restrict list, const long first, const int count, TEXELS_PARAMETERS) {
   const int g = get_global_id(0);
   if (g >= count) return;
-  const int width = columns * cuts, height = rows * cuts, index = first + g;
+  const long width = columns * cuts, height = rows * cuts, index = first + g;  // 16K × 8K texels of 4 × 4 nodes
   const int face = index / (width * height), i = index / width % height, j = index % width;
   vec3 d;
   int texel;

@@ -2,7 +2,7 @@
 // Condon-Shortley sign, in the order L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22. [Ramamoorthi2001, eq. 3]
 
 // partial: [chunks][28]: the 9 × 3 coefficients of wL, then ∑w.
-__kernel void harmonics(__global scalar *restrict partial, const int sources, const int chunk, const int first_chunk,
+__kernel void harmonics(__global scalar *restrict partial, const int sources, const int chunk,
                         __global const scalar *restrict source) {
   const int g = get_global_id(0), end = min(sources, (g + 1) * chunk);
   if (g * chunk >= sources) return;
@@ -24,5 +24,5 @@ __kernel void harmonics(__global scalar *restrict partial, const int sources, co
       for (int c = 0; c < 3; c++) sum[3 * l + c] += Y[l] * p[4 + c];
     sum[27] += p[3];
   }
-  for (int k = 0; k < 28; k++) partial[(size_t)(first_chunk + g) * 28 + k] = sum[k];
+  for (int k = 0; k < 28; k++) partial[(size_t)g * 28 + k] = sum[k];
 }

@@ -1,6 +1,7 @@
 """One environment -> the files engines load: key, skipping, ownership, writing, manifest."""
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import math
@@ -102,8 +103,10 @@ def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str =
         elif isinstance(item, (str, os.PathLike)):
             path = Path(os.path.abspath(item))
             names.append(DEMO if _is_demo(item) else path.name if path.is_dir() else path.stem)
+        elif isinstance(item, np.ndarray):
+            names.append("array")
         else:
-            raise UsageError("bake takes paths; make an environment of an array first and give it a name")
+            raise UsageError(f"bake takes paths, arrays and environments, not {type(item).__name__}")
     for k, name in enumerate(names):
         if name in names[:k]:
             raise UsageError(f"two inputs are named {name!r}: their outputs would be the same files")
@@ -121,7 +124,7 @@ def _is_demo(item: Any) -> bool:
 def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str | None = None,
          dry_run: bool = False, progress: Callable[[str, str, float], None] | None = None,
          **options: Any) -> list[Baked]:
-    """Bakes environments (a path or a list; `demo` is built in) into `output`.
+    """Bakes environments (a path, an array, an `environment`, or a list of them; `demo` is built in) into `output`.
 
     options: for_ ("raw,exr"), size, min_size, ndf, tolerance or quality, rotate (degrees), exposure (stops),
     nonfinite ("refuse", "zero"), force. Files go to `output/ENGINE/STEM…`; `output/STEM.json`, written last,
@@ -129,7 +132,7 @@ def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str |
     FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an environment
     that fails.
     """
-    single = isinstance(sources, (str, os.PathLike, Environment))
+    single = isinstance(sources, (str, os.PathLike, np.ndarray, Environment))
     request = order([sources] if single else list(sources), output, **options)
     return [bake_one(request, k, device, dry_run=dry_run, progress=progress) for k in range(len(request.names))]
 
@@ -137,6 +140,14 @@ def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str |
 def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_run: bool = False,
              progress: Callable[[str, str, float], None] | None = None) -> Baked:
     """The k-th environment of an order."""
+    try:
+        return _bake_one(request, k, device, dry_run, progress)
+    except OSError as error:  # what the system says of a path in passing
+        raise FileError(f"cannot use {error.filename or request.output}: {error.strerror or error}") from error
+
+
+def _bake_one(request: Order, k: int, device: Device | str | None, dry_run: bool,
+              progress: Callable[[str, str, float], None] | None) -> Baked:
     begin = time.perf_counter()
     name, item = request.names[k], request.sources[k]
     on: Device | None = device if isinstance(device, Device) else None
@@ -146,7 +157,7 @@ def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_
     # With its rotation and exposure applied: the kernels see the environment only through these.
     env = environment(item, rotate=request.rotate, exposure=request.exposure,
                       nonfinite=request.nonfinite)  # type: ignore[arg-type]
-    recipe = _canonical(request)
+    recipe = _canonical(request, env)
     key = _key(env, recipe)
     targets = _targets(request, name)
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
@@ -163,8 +174,25 @@ def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_
     _check_ownership([*files, path], known, request, path)
     if dry_run:
         return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, env.notices)
-    for folder in sorted({request.output, *(file.parent for file in files)}):
-        _check_writable(folder)
+    folders = sorted({request.output, *(file.parent for file in files)})
+    made = [folder for folder in folders if not folder.exists()]
+    try:
+        for folder in folders:
+            _check_writable(folder)
+        return _make(request, k, env, recipe, key, device, on, progress, there, planned, begin)
+    except BaseException:
+        for folder in reversed(made):
+            with contextlib.suppress(OSError):  # not empty: something of ours is whole
+                folder.rmdir()
+        raise
+
+
+def _make(request: Order, k: int, env: Environment, recipe: dict[str, Any], key: str, device: Device | str | None,
+          on: Device | None, progress: Callable[[str, str, float], None] | None, there: dict[str, Any] | None,
+          planned: tuple[LevelPlan, ...], begin: float) -> Baked:
+    """Bakes and writes; `there` is the manifest that is replaced."""
+    name = request.names[k]
+    path = request.output / f"{name}.json"
     on = on or choose_device(device if isinstance(device, str) else None)
     tell = (lambda what, share: progress(name, what, share)) if progress else None
     lit = light(on, env, request.recipe, latlong=any(e.latlong for e in request.engines), seed=key, progress=tell)
@@ -181,17 +209,46 @@ def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_
                 "sha256": digest_file(transaction.staged(target.path)),
                 "bytes": transaction.staged(target.path).stat().st_size}
         manifest["files"] = digests
+        stale, manifest["kept"] = _superseded(request, there, digests)
         write_manifest(path, manifest, into=transaction)
         transaction.commit()
+    for file in stale:
+        with contextlib.suppress(OSError):
+            file.unlink()
     seconds = [level.seconds for level in lit.levels]
     rows = tuple({**row, "seconds": s} for row, s in zip(manifest["levels"], seconds, strict=True))
-    return Baked(name, "done", files, manifest, planned, sizes, env.notices, rows, time.perf_counter() - begin)
+    targets = _targets(request, name)
+    return Baked(name, "done", tuple(t.path for t in targets), manifest, planned, tuple(t.nbytes for t in targets),
+                 env.notices, rows, time.perf_counter() - begin)
 
 
-def _canonical(request: Order) -> dict[str, Any]:
+def _superseded(request: Order, there: dict[str, Any] | None,
+                digests: dict[str, Any]) -> tuple[list[Path], dict[str, Any]]:
+    """What the old manifest proves ours and the new bake does not write: files of the same engines, which are
+    stale (a longer chain's last levels), and entries of other engines, which stay and stay ours."""
+    baked = {engine.name for engine in request.engines}
+    stale, kept = [], {}
+    for relative, entry in _entries(there).items() if there else ():
+        file = request.output / relative
+        if relative in digests or not file.is_file() or digest_file(file) != entry.get("sha256"):
+            continue
+        if relative.split("/")[0] in baked:
+            stale.append(file)
+        else:
+            kept[relative] = entry
+    return stale, kept
+
+
+def _entries(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Every file that a manifest proves ours, those of earlier bakes for other engines too."""
+    return {**manifest.get("kept", {}), **manifest["files"]}
+
+
+def _canonical(request: Order, env: Environment) -> dict[str, Any]:
     """The recipe as data: everything that changes the bytes, and nothing else."""
-    return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines), "rotate": request.rotate,
-            "exposure": request.exposure, "nonfinite": request.nonfinite, "irradiance": IRRADIANCE_SIZE,
+    return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines),
+            "rotate": round(math.degrees(env.rotation), 9),
+            "exposure": env.exposure, "nonfinite": request.nonfinite, "irradiance": IRRADIANCE_SIZE,
             "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE}}
 
 
@@ -210,9 +267,10 @@ def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
     found = read_manifest(path)
     if found is None or found.get("name") != name:
         return None
-    files = found.get("files")
-    sound = isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values())
-    return found if sound else None
+    for files in (found.get("files"), found.get("kept", {})):
+        if not (isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values())):
+            return None
+    return found
 
 
 def _whole(manifest: dict[str, Any], output: Path) -> bool:
@@ -229,7 +287,7 @@ def _check_ownership(paths: Sequence[Path], known: Sequence[dict[str, Any]], req
         return
     ours: dict[str, set[Any]] = {}
     for m in known:
-        for relative, entry in m["files"].items():
+        for relative, entry in _entries(m).items():
             ours.setdefault(relative, set()).add(entry.get("sha256"))
     for path in paths:
         if not path.exists():
@@ -270,6 +328,7 @@ def _manifest(name: str, env: Environment, recipe: dict[str, Any], key: str, dev
                    "notices": list(env.notices)},
         "levels": [row(level, kept) for level, kept in zip(lit.levels, lit.energy_kept, strict=True)],
         "latlong_levels": [row(level) for level in lit.latlongs],
+        "coverage_levels": [row(level) for level in (*lit.coverage, *lit.latlong_coverage)],
         "irradiance": row(lit.irradiance),
         "sh": {"coefficients": lit.sh.tolist(), "error": lit.sh_error},
         "dfg": {"size": DFG_SIZE, "error": table.error, "rule": table.rule},
@@ -298,7 +357,7 @@ def _npz(request: Order, engine: Engine, name: str, lit: Lighting | None, table:
     for statistic in ("roughness", "error", "worst", "rmse"):
         arrays[statistic] = np.array([getattr(level, statistic) for level in lit.levels])
     arrays |= {"irradiance": lit.irradiance.texels, "sh": lit.sh, "dfg": table.values}
-    arrays |= {f"coverage_{k}": a for k, a in enumerate(lit.coverage)}
+    arrays |= {f"coverage_{k}": level.texels[..., 0] for k, level in enumerate(lit.coverage)}
     return [Target(path, engine.name, 4 * count, lambda t: write_npz(path, arrays, into=t))]
 
 
@@ -331,7 +390,7 @@ def _exr(request: Order, engine: Engine, name: str, lit: Lighting | None, table:
             (f"specular_{k}", cube, lit.levels[k], lit.coverage),
             (f"specular_{k}_latlong", wide, lit.latlongs[k], lit.latlong_coverage),
         ):
-            add(ending, shape, level.texels, coverage[k] if coverage else None, attributes={
+            add(ending, shape, level.texels, coverage[k].texels[..., 0] if coverage else None, attributes={
                 "roughness": level.roughness, "error": level.error, "worst": level.worst, "rmse": level.rmse,
                 "method": level.method})
     irradiance = (6 * IRRADIANCE_SIZE, IRRADIANCE_SIZE)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import sys
@@ -28,10 +29,14 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device o
 """
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+             invoke_without_command=True)
 @click.version_option(package_name="whitefurnace")
-def cli() -> None:
+@click.pass_context
+def cli(context: click.Context) -> None:
     """Bakes image-based lighting and integrates BRDFs on OpenCL devices, and states the error of what it writes."""
+    if context.invoked_subcommand is None:
+        click.echo(context.get_help())
 
 
 @cli.command(epilog=EPILOG_BAKE)
@@ -88,9 +93,11 @@ def bake(environments: tuple[str, ...], output: Path, for_: str, device: str | N
     if len(order.names) == 1 and failures:
         raise failures[0][1]
     if failures:
-        codes = {error.exit_code for _, error in failures}
-        _say(f"error: {len(failures)} of {len(order.names)} environments failed")
-        sys.exit(codes.pop() if len(failures) == len(order.names) and len(codes) == 1 else 8)
+        from whitefurnace.errors import PartialError
+
+        alike = len({type(error) for _, error in failures}) == 1 and len(failures) == len(order.names)
+        raise (type(failures[0][1]) if alike else PartialError)(
+            f"{len(failures)} of {len(order.names)} environments failed")
 
 
 @cli.command(epilog="\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 one works, 4 none does.")
@@ -172,13 +179,17 @@ def _abandon_stdout() -> None:
 
 def main(argv: list[str] | None = None) -> None:
     """Entry point: runs the command and turns every error into one sentence and its exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without ² or × shows a ?, not a traceback
     try:
         result = cli.main(argv, prog_name="whitefurnace", standalone_mode=False)
         sys.stdout.flush()
         code = result if isinstance(result, int) else 0
     except WhitefurnaceError as error:
         if "--json" in (sys.argv[1:] if argv is None else argv):
-            _json({"event": "error", "message": str(error), "exit_code": error.exit_code})
+            with contextlib.suppress(OSError):  # nobody reads stdout; the code still tells
+                _json({"event": "error", "message": str(error), "exit_code": error.exit_code})
         _say(f"error: {error}")
         code = error.exit_code
     except click.exceptions.Exit as done:

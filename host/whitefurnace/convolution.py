@@ -7,7 +7,6 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -19,6 +18,19 @@ from whitefurnace.catalogue.rule import gauss
 from whitefurnace.device import Buffer, Device, Kernel, Program
 from whitefurnace.environments import Environment, cube_solid_angles, latlong_solid_angles
 from whitefurnace.recipe import Chosen
+from whitefurnace.sphere import (
+    Shape,
+    block_bounds,
+    bounds,
+    coarsening,
+    composite,
+    cube_centres,
+    cube_tables,
+    grid_tangents,
+    latlong_centres,
+    latlong_tables,
+    row_edges,
+)
 
 Progress = Callable[[str, float], None]
 """Called with what is being done and its share of the whole, 0 to 1."""
@@ -28,7 +40,6 @@ Progress = Callable[[str, float], None]
 ROUNDING = {32: 2e-5, 64: 2e-7}
 
 HARMONICS_CHUNK = 1024
-BLOCK = 16  # sources that `convolve_near` takes or leaves together
 
 
 @dataclass(frozen=True)
@@ -48,87 +59,6 @@ class Level:
     grid: int
     pairs: int
     seconds: float
-
-
-@dataclass(frozen=True)
-class Shape:
-    """Where a level is evaluated: the texel centres of a cube or of a lat-long image."""
-
-    latlong: bool
-    size: int  # face edge, or height of the lat-long
-
-    @property
-    def dims(self) -> tuple[int, ...]:
-        return (self.size, 2 * self.size) if self.latlong else (6, self.size, self.size)
-
-    @property
-    def count(self) -> int:
-        return int(np.prod(self.dims))
-
-    def directions(self) -> np.ndarray:
-        return _latlong_directions(self.size) if self.latlong else _cube_directions(self.size)
-
-    def tiled(self) -> np.ndarray:
-        """Flat indices in an order that keeps neighbours together: tiles of 4 × 4 within tiles of 8 × 8."""
-        index = np.arange(self.count).reshape(-1, *self.dims[-2:])
-        planes, height, width = index.shape
-        if height % 8 or width % 8:
-            return index.ravel()
-        return index.reshape(planes, height // 8, 2, 4, width // 8, 2, 4).transpose(0, 1, 4, 2, 5, 3, 6).ravel()
-
-    def solid_angles(self) -> np.ndarray:
-        """(count,) float64."""
-        if self.latlong:
-            return np.repeat(latlong_solid_angles(self.size, 2 * self.size), 2 * self.size)
-        return np.tile(cube_solid_angles(self.size).ravel(), 6)
-
-
-@cache
-def _cube_directions(size: int) -> np.ndarray:
-    """(3, 6 size²) unit directions of texel centres, float64, in the GL-direct layout."""
-    a = (2 * np.arange(size) + 1) / size - 1
-    t, s = np.meshgrid(a, a, indexing="ij")
-    o = np.ones_like(s)
-    faces = [(o, -t, -s), (-o, -t, s), (s, o, t), (s, -o, -t), (s, -t, o), (-s, -t, -o)]
-    d = np.array([np.stack(f) for f in faces]).transpose(1, 0, 2, 3).reshape(3, -1)
-    return d / np.sqrt((d * d).sum(0))
-
-
-@cache
-def _latlong_directions(height: int) -> np.ndarray:
-    """(3, 2 height²) unit directions of the texel centres of a lat-long image, float64."""
-    theta = (np.arange(height) + 0.5) * math.pi / height
-    phi = (np.arange(2 * height) + 0.5) * math.pi / height - math.pi
-    theta, phi = np.meshgrid(theta, phi, indexing="ij")
-    return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)]).reshape(3, -1)
-
-
-@cache
-def _grid_directions(n: int) -> np.ndarray:
-    """(3, 6 n²) directions of the equiangular nodes, in the order of `grid_list`."""
-    u = np.tan(((2 * np.arange(n) + 1) / n - 1) * math.pi / 4)
-    t, s = (a.ravel() for a in np.meshgrid(u, u, indexing="ij"))
-    o = np.ones_like(s)
-    faces = [(o, -t, -s), (-o, -t, s), (s, o, t), (s, -o, -t), (s, -t, o), (-s, -t, -o)]
-    order = Shape(False, n).tiled()
-    d = np.array([np.stack(f) for f in faces]).transpose(1, 0, 2).reshape(3, -1)[:, order]
-    return d / np.sqrt((d * d).sum(0))
-
-
-def _bounds(directions: np.ndarray, count: int) -> np.ndarray:
-    """(m, 4): centre and largest chord to it, of each `count` consecutive directions (3, m·count)."""
-    d = directions.reshape(3, -1, count)
-    centre = d.mean(2)
-    radius = np.sqrt(((d - centre[..., None]) ** 2).sum(0).max(1))
-    return np.concatenate([centre, radius[None] * (1 + 1e-6) + 1e-6]).T.copy()
-
-
-@cache
-def _block_bounds(n: int) -> np.ndarray:
-    """(6 n²/64, 5, 4) float64: bounds of every 64 sources of the n × n grid, then of each BLOCK of them."""
-    directions = _grid_directions(n)
-    outer, inner = _bounds(directions, 4 * BLOCK), _bounds(directions, BLOCK)
-    return np.concatenate([outer[:, None], inner.reshape(-1, 4, 4)], 1)
 
 
 def lobe_norm(ndf: Model, parameters: dict[str, float]) -> float:
@@ -163,9 +93,9 @@ class Convolver:
         self.latlong = e.kind == "latlong"
         self.rows, self.columns = e.texels.shape[-3:-1]
         self.faces = 1 if self.latlong else 6
-        self._mean = np.array(e.statistics["mean"])
-        mean = float(self._mean.mean())
-        self.scale = 2.0 ** -round(math.log2(mean)) if mean > 0 and math.isfinite(mean) else 1.0
+        self.mean = mean = float(np.mean(e.statistics["mean"]))
+        # Within ±100, so that neither the factor nor what it multiplies leaves float32.
+        self.scale = 2.0 ** min(max(-round(math.log2(mean)), -100), 100) if mean > 0 else 1.0
         texels = device.aligned_empty(e.texels.shape, np.float32)
         np.multiply(e.texels, np.float32(self.scale), out=texels)
         self.constant = bool((texels == texels[(0,) * (texels.ndim - 1)]).all())
@@ -173,6 +103,7 @@ class Convolver:
         self._texels = texels
         self._radiance = device.array(texels)
         self._bright_shares = np.empty(0)
+        self._brightest = np.arange(0)
         self._bright_cache: dict[tuple[int, int, int], Buffer] = {}
         self.base = texels.reshape(-1, 3).min(0)
         self._clipped, self._bright = self._extract(texels)
@@ -180,12 +111,9 @@ class Convolver:
         self._tables: dict[int, tuple[Buffer, Buffer]] = {}
         self._grids: dict[int, Buffer] = {}
         self._fine: tuple[int, Buffer] | None = None
+        self._fine_cuts = 0
+        self.cuts = 1  # quadrature nodes a texel edge in the anterpolation
         self._harmonics: dict[int, np.ndarray] = {}  # 9 × 3 coefficients and ∑w, by cuts
-
-    @property
-    def energy(self) -> float:
-        """∫ L dω of the source, all channels together."""
-        return 4 * math.pi * float(np.sum(self._mean))
 
     # ------------------------------------------------------------------------------------------- sources
 
@@ -205,9 +133,11 @@ class Convolver:
         count = min(planning.BRIGHT, max(flat.size // 32, 2 if flat.size >= 8 else 0))
         if count == 0:
             self.share = float(flat.max()) / total if total > 0 else 0.0
+            self._brightest = np.array([int(flat.argmax())])
             return self.device.array(clipped), (np.arange(0), np.empty((0, 3)))
         index = np.argpartition(flat, flat.size - count)[flat.size - count:]
         index = index[np.argsort(-flat[index], kind="stable")]
+        self._brightest = index[:8]
         level = flat[index].min()
         keep = np.divide(level, flat[index], out=np.ones(count, np.float32), where=flat[index] > 0)
         original = clipped[index]
@@ -221,9 +151,9 @@ class Convolver:
     def _table(self, cuts: int) -> tuple[Buffer, Buffer]:
         """Row and column tables of quadrature nodes, made in float64; see texels/*.clh."""
         if cuts not in self._tables:
-            x, w = (np.array([0.5]), np.array([1.0])) if cuts == 1 else _composite(cuts)
-            tables = (_latlong_tables(self.rows, self.columns, x, w, self.environment.rotation) if self.latlong
-                      else _cube_tables(self.rows, x, w))
+            x, w = (np.array([0.5]), np.array([1.0])) if cuts == 1 else composite(cuts)
+            tables = (latlong_tables(self.rows, self.columns, x, w, self.environment.rotation) if self.latlong
+                      else cube_tables(self.rows, x, w))
             rows, columns = (self.device.array(t.astype(self.kind)) for t in tables)
             self._tables[cuts] = rows, columns
         return self._tables[cuts]
@@ -242,10 +172,17 @@ class Convolver:
         size = self.device.local_size
         self.device.launch(kernel, (-(-count // size) * size,), args)
 
-    def _finest(self, n: int, alpha: float, tolerance: float = 1e-4) -> tuple[int, Buffer]:
+    def prepare(self, n: int, cuts: int) -> None:
+        """Says which grid is the finest that a set of levels needs and how finely texels are cut for it, so that
+        none is made from the texels twice."""
+        self.cuts = max(self.cuts, cuts)
+        self._finest(n)
+
+    def _finest(self, n: int) -> tuple[int, Buffer]:
         """The anterpolated grid made straight from the texels; coarser ones are made from it."""
-        if self._fine is None or self._fine[0] < n:
-            cuts = planning.cuts_for(self.texel, alpha, tolerance)
+        if self._fine is None or self._fine[0] < n or self._fine_cuts < self.cuts:
+            n = max(n, self._fine[0] if self._fine else 0)
+            self._fine_cuts = cuts = self.cuts
             grid = self.device.empty((6, n, n, 4), self.kind)
             moments = self.device.empty(((n - 1) ** 2, planning.ORDER**2 * 4), self.kind)
             for face in range(6):
@@ -256,16 +193,12 @@ class Convolver:
             self._grids.clear()
         return self._fine
 
-    def prepare(self, n: int, alpha: float, tolerance: float) -> None:
-        """Makes the finest grid that a set of levels will need, so that none is made from the texels twice."""
-        self._finest(n, alpha, tolerance)
-
-    def _grid(self, n: int, alpha: float) -> Buffer:
+    def _grid(self, n: int) -> Buffer:
         """The source list of the n × n grid."""
         if n not in self._grids:
-            fine, grid = self._finest(n, alpha)
+            fine, grid = self._finest(n)
             if n < fine:
-                matrix, first, last = (self.device.array(a) for a in _coarsening(fine, n, self.kind.char))
+                matrix, first, last = (self.device.array(a) for a in coarsening(fine, n, self.kind.char))
                 sizes = (np.int32(fine), np.int32(n))
                 half = self.device.empty((6, fine, n, 4), self.kind)
                 self._launch(self._texel_kernel("coarsen"), 6 * fine * n,
@@ -273,7 +206,7 @@ class Convolver:
                 grid = self.device.empty((6, n, n, 4), self.kind)
                 self._launch(self._texel_kernel("coarsen"), 6 * n * n,
                              (grid, half, matrix, first, last, *sizes, np.int32(n), np.int32(6 * n)))
-            tangent = np.tan(((2 * np.arange(n) + 1) / n - 1) * math.pi / 4).astype(self.kind)
+            tangent = grid_tangents(n).astype(self.kind)
             listed = self.device.empty((6 * n * n, 8), self.kind)
             self._launch(self._texel_kernel("grid_list"), 6 * n * n, (listed, np.int32(n),
                                                                       self.device.array(tangent), grid))
@@ -304,14 +237,18 @@ class Convolver:
             lists.append(self._bright_cache[key])
         return lists
 
+    def nodes(self, cuts: int) -> int:
+        """Quadrature nodes of the whole source at `cuts` an edge of each texel."""
+        return self.faces * self.rows * self.columns * cuts * cuts
+
     def _bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
         """Every node of the clipped source, in bands: (list, nodes in it, share done)."""
-        total = self.faces * self.rows * self.columns * cuts * cuts
+        total = self.nodes(cuts)
         listed = self.device.empty((min(planning.NODES_A_BAND, total), 8), self.kind)
         for first in range(0, total, planning.NODES_A_BAND):
             count = min(planning.NODES_A_BAND, total - first)
             self._launch(self._texel_kernel("nodes"), count,
-                         (listed, np.int32(first), np.int32(count), *self._texel_arguments(cuts, self._clipped)))
+                         (listed, np.int64(first), np.int32(count), *self._texel_arguments(cuts, self._clipped)))
             yield listed, count, (first + count) / total
 
     # ------------------------------------------------------------------------------------------- lobes
@@ -342,28 +279,28 @@ class Convolver:
         """The level over all directions of `shape` from the n × n grid and the bright texels, (dims, 3)."""
         if n % 8:
             raise ValueError(f"a grid of {n} nodes an edge is not a multiple of the blocks' 8")
+        self.prepare(n, planning.cuts_for(self.texel, lobe.alpha, tolerance, self.share))
         split = planning.split_for(n, lobe.alpha)
-        listed, bright = self._grid(n, lobe.alpha), self._bright_lists(lobe, tolerance)
-        far = self._grid(split.grid, lobe.alpha) if split else None
-        blocks = self.device.array(_block_bounds(n).astype(self.kind)) if split else None
+        listed, bright = self._grid(n), self._bright_lists(lobe, tolerance)
+        far = self._grid(split.grid) if split else None
+        blocks = self.device.array(block_bounds(n).astype(self.kind)) if split else None
         group = self._step
         step = group * self.device.local_size
         count = listed.shape[0]
         pairs = planning.pairs_of(1, n, lobe.alpha)
         tile = max(planning.PAIRS_A_LAUNCH // pairs // step, 1) * step
         order = shape.tiled()
-        directions = shape.directions()
         out = np.empty((shape.count, 3), np.float32)
         for begin in range(0, shape.count, tile):
             index = order[begin:begin + tile]
             padded = -(-len(index) // step) * step
-            part = np.pad(directions[:, index], ((0, 0), (0, padded - len(index))), mode="edge")
+            part = np.pad(shape.directions(index), ((0, 0), (0, padded - len(index))), mode="edge")
             block = self.device.array(part.astype(self.kind))
             chunks = -(-count // planning.CHUNK) + (-(-far.shape[0] // planning.CHUNK) if far else 0)
             partial = self.device.empty((chunks, 4, padded), self.kind)
             if split and far and blocks:
                 window = self.real(split.q0), self.real(split.q1)
-                groups = self.device.array(_bounds(part, group).astype(self.kind))
+                groups = self.device.array(bounds(part, group).astype(self.kind))
                 splits = self._partials(lobe, listed, count, block, partial, 0, "convolve_near", *window, groups,
                                         blocks)
                 splits += self._partials(lobe, far, far.shape[0], block, partial, splits, "convolve_far", *window)
@@ -396,7 +333,8 @@ class Convolver:
             block = np.pad(directions, ((0, 0), (0, padded - directions.shape[1])), mode="edge")
             jobs.append((lobe, self.device.array(block.astype(self.kind)), np.zeros((4, padded))))
         coefficients = np.zeros(28)
-        for listed, count, _share in self._bands(cuts):
+        for listed, count, share in self._bands(cuts):
+            self.progress("exact integrals", share)
             coefficients += self._harmonic_sums(listed, count)
             for lobe, directions_on, sums in jobs:
                 sums += self._list_sums(lobe, listed, count, directions_on)
@@ -423,7 +361,7 @@ class Convolver:
         chunks = -(-count // HARMONICS_CHUNK)
         partial = self.device.empty((chunks, 28), self.kind)
         self._launch(self._texel_kernel("harmonics"), chunks,
-                     (partial, np.int32(count), np.int32(HARMONICS_CHUNK), np.int32(0), listed))
+                     (partial, np.int32(count), np.int32(HARMONICS_CHUNK), listed))
         return partial.read().sum(0, dtype=np.float64)
 
     def harmonics(self) -> tuple[np.ndarray, float]:
@@ -450,9 +388,13 @@ class Convolver:
         """The mean source radiance over each texel of `shape`, (dims, 3) float32, by exact overlaps."""
         if self._same_texels(shape):
             return self._texels.copy()
-        precision = 64 if self.device.fp64 else 32
-        program = self.device.build(source.overlap().text, {"W": 1, "T": 1, "PRECISION": precision})
-        real = np.dtype(f"f{precision // 8}").type
+        if not self.device.fp64:
+            # Float32 places edges to 1e-5 of a texel, and a sliver of sun is brighter than that: the host's float64.
+            index = np.arange(shape.count)
+            parts = [self.exact_means(shape, part) for part in np.array_split(index, -(-shape.count // 4096))]
+            return np.concatenate(parts).astype(np.float32).reshape(*shape.dims, 3)
+        program = self.device.build(source.overlap().text, {"W": 1, "T": 1, "PRECISION": 64})
+        real = np.float64
         if not self.latlong:
             return self._means_of_cube(program, shape, real)
         if shape.latlong:
@@ -460,8 +402,8 @@ class Convolver:
             self._launch(program.kernel("mean_latlong"), shape.count,
                          (level, np.int32(shape.size), np.int32(2 * shape.size), np.int32(self.rows),
                           np.int32(self.columns), real(self.environment.rotation),
-                          self.device.array(_row_edges(self.rows, real)),
-                          self.device.array(_row_edges(shape.size, real)), self._radiance))
+                          self.device.array(row_edges(self.rows, real)),
+                          self.device.array(row_edges(shape.size, real)), self._radiance))
             return level.read()
         return self._means_by_edges(program, shape.size, real)
 
@@ -486,7 +428,7 @@ class Convolver:
         return out.reshape(*shape.dims, 3)
 
     def _means_by_edges(self, program: Any, size: int, real: Any) -> np.ndarray:
-        edges = self.device.array(_row_edges(self.rows, real))
+        edges = self.device.array(row_edges(self.rows, real))
         kind = np.dtype(real)
         # Bands of rows bound the float64 prefix sums to 64 MiB whatever the source.
         band = max(1, min(self.rows, (64 << 20) // (3 * self.columns * kind.itemsize)))
@@ -525,19 +467,22 @@ class Convolver:
 
     def _near_bright(self, shape: Shape) -> np.ndarray:
         """The NEAR_BRIGHT texels nearest the brightest sources, nearest to any of them."""
-        index, _ = self._bright
-        if not len(index):
+        if self.constant:
             return np.arange(0)
-        targets = self._texel_centres(index[:8])
-        closeness = (targets @ shape.directions()).max(0)
-        count = min(planning.NEAR_BRIGHT, shape.count)
-        return np.sort(np.argpartition(-closeness, count - 1)[:count])
+        targets = self._texel_centres(self._brightest)
+        best, closeness = np.arange(0), np.empty(0)
+        for first in range(0, shape.count, 1 << 18):
+            index = np.arange(first, min(first + (1 << 18), shape.count))
+            best = np.concatenate([best, index])
+            closeness = np.concatenate([closeness, (targets @ shape.directions(index)).max(0)])
+            keep = np.argsort(-closeness, kind="stable")[:planning.NEAR_BRIGHT]
+            best, closeness = best[keep], closeness[keep]
+        return np.sort(best)
 
     def _texel_centres(self, index: np.ndarray) -> np.ndarray:
         """(m, 3) directions of source texels by flat index."""
         e = self.environment
-        d = (_latlong_centres(self.rows, self.columns, index) if self.latlong
-             else _cube_directions(self.rows)[:, index])
+        d = latlong_centres(self.rows, self.columns, index) if self.latlong else cube_centres(self.rows, index)
         c, s = math.cos(e.rotation), math.sin(e.rotation)
         return np.stack([c * d[0] - s * d[2], d[1], s * d[0] + c * d[2]], 1)
 
@@ -561,93 +506,3 @@ def ndf_lobe(choice: Chosen, roughness: float, parameters: dict[str, float]) -> 
 
 
 COSINE = Lobe("irradiance", None, (), math.pi, 1.0)
-
-
-def _composite(cuts: int) -> tuple[np.ndarray, np.ndarray]:
-    """cuts/2 cells of two Gauss points each on [0, 1]."""
-    cells = cuts // 2
-    x, w = gauss(2)
-    nodes = (np.arange(cells)[:, None] + x) / cells
-    return nodes.ravel(), np.tile(w / cells, cells)
-
-
-def _latlong_tables(rows: int, columns: int, x: np.ndarray, w: np.ndarray,
-                    rotation: float) -> tuple[np.ndarray, np.ndarray]:
-    """(cos θ, sin θ, weight) by refined row, each row's weights summing to cos θ0 - cos θ1; and
-    (cos φ, sin φ, weight) by refined column."""
-    theta = (np.arange(rows)[:, None] + x) * (math.pi / rows)
-    weight = np.sin(theta) * w
-    weight *= (-np.diff(np.cos(np.arange(rows + 1) * math.pi / rows)) / weight.sum(1))[:, None]
-    phi = (np.arange(columns)[:, None] + x) * (2 * math.pi / columns) - math.pi + rotation
-    across = np.broadcast_to(w * (2 * math.pi / columns), phi.shape)
-    return (np.stack([np.cos(theta), np.sin(theta), weight], -1).reshape(-1, 3),
-            np.stack([np.cos(phi), np.sin(phi), across], -1).reshape(-1, 3))
-
-
-def _cube_tables(size: int, x: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(coordinate, weight, 0) by refined row; the same by column, followed by the solid-angle corrections."""
-    s = ((np.arange(size)[:, None] + x) * (2 / size) - 1).ravel()
-    weight = np.tile(w * (2 / size), size)
-    density = weight[:, None] * weight * (1 + s[:, None] ** 2 + s**2) ** -1.5
-    plain = density.reshape(size, len(x), size, len(x)).sum((1, 3))
-    table = np.stack([s, weight, np.zeros_like(s)], 1)
-    correction = cube_solid_angles(size) / plain
-    return table, np.concatenate([table.ravel(), correction.ravel()])
-
-
-def _row_edges(rows: int, real: Any) -> np.ndarray:
-    """(cos θ, cot θ) of the rows + 1 edges; the poles' cotangents are ±1e300 (1e30 in float32), never used
-    but as a bound."""
-    theta = np.arange(rows + 1) * math.pi / rows
-    cosine, sine = np.cos(theta), np.sin(theta)
-    if rows % 2 == 0:
-        cosine[rows // 2] = 0.0
-    sine[[0, -1]] = 1e-30
-    return np.stack([cosine, cosine / sine], 1).astype(real)
-
-
-def _latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
-    theta = (index // columns + 0.5) * math.pi / rows
-    phi = (index % columns + 0.5) * 2 * math.pi / columns - math.pi
-    return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)])
-
-
-@cache
-def _coarsening(fine: int, coarse: int, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The interpolation matrix (fine, coarse) between equiangular nodes, and for each coarse node the range
-    [first, last) of fine nodes it takes part in."""
-    order = min(planning.ORDER, coarse)
-    x = (2 * np.arange(fine) + 1) / fine / 2 * coarse - 0.5  # in coarse node numbers
-    start = np.clip(np.floor(x).astype(int) - (order // 2 - 1), 0, coarse - order)
-    matrix = np.zeros((fine, coarse))
-    for a in range(order):
-        weight = np.ones(fine)
-        for b in range(order):
-            if b != a:
-                weight *= (x - (start + b)) / (a - b)
-        matrix[np.arange(fine), start + a] = weight
-    touched = (np.arange(coarse) >= start[:, None]) & (np.arange(coarse) < start[:, None] + order)
-    first = touched.argmax(0)
-    last = fine - touched[::-1].argmax(0)
-    return matrix.astype(kind), first.astype(np.int32), last.astype(np.int32)
-
-
-def statement(values: np.ndarray, reference: np.ndarray, sample: tuple[np.ndarray, np.ndarray],
-              solid_angle: np.ndarray, mean: float, total: int) -> tuple[float, float, float]:
-    """(error, worst, rmse) of a level from its sample.
-
-    sample: texel indices, a uniform draw and a stratum. values, reference: (m, 3) and solid_angle: (m,) of the
-    two in this order. A texel's error is max over channels of |x - ref| / max(ref, 1e-3 · mean), 0/0 = 0. In
-    `rmse` the stratum stands for itself and the uniform texels outside it, by inverse probability, for the rest.
-    """
-    reference = reference.astype(np.float64)
-    difference = np.abs(values - reference)
-    floor = np.maximum(reference, 1e-3 * mean)
-    errors = np.divide(difference, floor, out=np.zeros_like(difference), where=floor > 0).max(1)
-    weight = solid_angle.copy()
-    uniform = len(sample[0])
-    outside = ~np.isin(sample[0], sample[1])
-    weight[:uniform] *= outside * (total - len(sample[1])) / max(int(outside.sum()), 1)
-    energy = float((weight[:, None] * reference**2).sum())
-    rmse = math.sqrt(float((weight[:, None] * difference**2).sum()) / energy) if energy > 0 else 0.0
-    return float(errors[:uniform].max()), float(errors.max()), rmse

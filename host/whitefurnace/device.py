@@ -29,7 +29,7 @@ INSTALL = (
 
 
 class Tuning(NamedTuple):
-    """How a kind of device likes its work; measured where the notes of the README say so, else safe."""
+    """How a kind of device likes its work: measured on AVX-512 CPUs, elsewhere safe."""
 
     vectors: int  # T: vectors of W lanes a work item
     local_size: int  # work items a group

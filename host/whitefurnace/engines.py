@@ -28,7 +28,7 @@ ENGINES = {
 def engines(names: str) -> tuple[Engine, ...]:
     """The presets of a comma-separated list, each once. Raises UsageError with the nearest name."""
     chosen = []
-    for name in names.split(","):
+    for name in (part.strip() for part in names.split(",")):
         if name not in ENGINES:
             raise UsageError(f"unknown engine {name!r}{nearest(name, ENGINES)}")
         if ENGINES[name] not in chosen:

@@ -12,12 +12,14 @@ import numpy as np
 
 from whitefurnace import plan as planning
 from whitefurnace.catalogue import Model
-from whitefurnace.convolution import COSINE, ROUNDING, Convolver, Level, Lobe, Progress, Shape, ndf_lobe, statement
+from whitefurnace.certificate import statement, texel_errors
+from whitefurnace.convolution import COSINE, ROUNDING, Convolver, Level, Lobe, Progress, ndf_lobe
 from whitefurnace.device import Device, choose_device
 from whitefurnace.environments import Environment, cube_solid_angles, environment, latlong_solid_angles
 from whitefurnace.errors import CheckError, UsageError
 from whitefurnace.plan import LevelPlan
 from whitefurnace.recipe import IRRADIANCE_SIZE, Chain, chain, tolerance_of
+from whitefurnace.sphere import Shape
 
 
 @dataclass(frozen=True)
@@ -103,41 +105,34 @@ def irradiance_job(convolver: Convolver, size: int, tolerance: float) -> Job:
 def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> list[Level]:
     """Makes, certifies and where needed refines every level, in the order of `jobs`.
 
+    The exact values come first: how finely texels must be cut for them is how finely the grids need them too.
     Raises CheckError when a level misses the tolerance and finer grids do not help.
     """
-    # The finest grid first: the coarser ones are made from it.
-    grids = [(job.plan.grid, job.lobe.alpha) for job in jobs if job.lobe]
-    if grids:
-        convolver.prepare(*max(grids), tolerance)
+    begin = time.perf_counter()
+    samples = [convolver.sample(job.shape) for job in jobs]
+    jobs, references, doubts = _references(convolver, jobs, samples, tolerance)
+    if any(job.lobe for job in jobs):
+        convolver.prepare(max(job.plan.grid for job in jobs), max(job.plan.cuts for job in jobs if job.lobe))
+    common = (time.perf_counter() - begin) / len(jobs)
     work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0)
             for job in jobs]
-    done = 0
-    texels, seconds = [], []
-    for job, cost in zip(jobs, work, strict=True):
-        begin = time.perf_counter()
-        texels.append(_make(convolver, job, tolerance, (0.8 * done / sum(work), 0.8 * (done + cost) / sum(work))))
-        seconds.append(time.perf_counter() - begin)
-        done += cost
-    samples = [convolver.sample(job.shape) for job in jobs]
-    begin = time.perf_counter()
-    references = _references(convolver, jobs, samples, tolerance)
-    share = (time.perf_counter() - begin) / max(len(jobs), 1)
     levels = []
     for k, job in enumerate(jobs):
-        level = _stated(convolver, job, texels[k], samples[k], references[k], seconds[k] + share)
+        begin = time.perf_counter()
+        share = sum(work[:k]) / sum(work), sum(work[:k + 1]) / sum(work)
+        level = _stated(convolver, job, _make(convolver, job, tolerance, share), samples[k], references[k], doubts[k])
         before, stuck = math.inf, 0
-        while level.error > tolerance:
+        while not level.error <= tolerance:  # NaN too
             finer = planning.refined(job.plan) if job.lobe else None
-            stuck = stuck + 1 if level.error > 0.9 * before else 0
+            stuck = stuck + 1 if not level.error <= 0.9 * before else 0
             if finer is None or stuck == 2:
-                raise CheckError(f"level of roughness {job.plan.roughness:.4g} has an error of {level.error:.2g}, over "
-                                 f"the tolerance {tolerance:g}, and a finer grid does not lower it")
+                what = "mean" if job.lobe is None else job.lobe.name
+                raise CheckError(f"level {what} of {'×'.join(map(str, job.shape.dims))} texels has an error of "
+                                 f"{level.error:.2g}, over the tolerance {tolerance:g}, and finer grids do not help")
             job, before = replace(job, plan=finer), level.error
-            begin = time.perf_counter()
-            again = _make(convolver, job, tolerance, (0.8, 0.8))
-            level = _stated(convolver, job, again, samples[k], references[k],
-                            level.seconds + time.perf_counter() - begin)
-        levels.append(level)
+            texels = _make(convolver, job, tolerance, share)
+            level = _stated(convolver, job, texels, samples[k], references[k], doubts[k])
+        levels.append(replace(level, seconds=time.perf_counter() - begin + common))
     return levels
 
 
@@ -147,41 +142,80 @@ def _make(convolver: Convolver, job: Job, tolerance: float, share: tuple[float, 
     return convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance, share)
 
 
-def _references(convolver: Convolver, jobs: Sequence[Job],
-                samples: Sequence[tuple[np.ndarray, np.ndarray]], tolerance: float) -> list[np.ndarray]:
-    """The exact values of each job's sample, (m, 3); lobes with the same cuts share one pass over the texels."""
+PROBES = 32
+"""Texels on which a reference is checked against itself with twice the nodes: the darkest, where a bright panel
+at the horizon shows most."""
+
+
+def _references(convolver: Convolver, jobs: Sequence[Job], samples: Sequence[tuple[np.ndarray, np.ndarray]],
+                tolerance: float) -> tuple[list[Job], list[np.ndarray], list[float]]:
+    """Jobs with the cuts their texels need, the exact values of each one's sample (m, 3), and what these may still
+    be off by.
+
+    For rough lobes the nodes are doubled until the values change by less than a tenth of the tolerance on the
+    PROBES darkest texels; the last change is the doubt. Lobes with the same cuts share one pass over the source.
+    """
+    jobs = list(jobs)
+    index = [np.concatenate(sample) for sample in samples]
     references: list[np.ndarray] = [np.empty(0)] * len(jobs)
-    chosen = [np.concatenate(sample) for sample in samples]
-    for cuts in sorted({job.plan.cuts for job in jobs if job.lobe}):
-        group = [k for k, job in enumerate(jobs) if job.lobe and job.plan.cuts == cuts]
-        wanted = [(jobs[k].lobe, jobs[k].shape.directions()[:, chosen[k]]) for k in group]
-        for k, values in zip(group, convolver.exact(wanted, cuts, tolerance), strict=True):  # type: ignore[arg-type]
-            references[k] = values
+    doubts = [0.0] * len(jobs)
     for k, job in enumerate(jobs):
         if job.lobe is None:
-            references[k] = convolver.exact_means(job.shape, chosen[k])
-    return references
+            references[k] = convolver.exact_means(job.shape, index[k])
+    todo = [k for k, job in enumerate(jobs) if job.lobe]
+    while todo:
+        for cuts in sorted({jobs[k].plan.cuts for k in todo}):
+            group = [k for k in todo if jobs[k].plan.cuts == cuts]
+            for k, values in zip(group, _exact(convolver, jobs, group, index, cuts, tolerance), strict=True):
+                references[k] = values
+                doubts[k] = planning.cuts_error(convolver.texel, _lobe(jobs[k]).alpha, cuts)
+        todo = [k for k in todo if _lobe(jobs[k]).alpha > planning.SHARP_ENOUGH and not convolver.constant]
+        again = []
+        for cuts in sorted({jobs[k].plan.cuts for k in todo}):
+            group = [k for k in todo if jobs[k].plan.cuts == cuts]
+            dark = {k: np.argsort(references[k].min(1), kind="stable")[:PROBES] for k in group}
+            probes = {k: index[k][dark[k]] for k in group}
+            finer = _exact(convolver, jobs, group, probes, 2 * cuts, tolerance)
+            for k, values in zip(group, finer, strict=True):
+                mean = convolver.mean * convolver.scale
+                doubts[k] = float(texel_errors(references[k][dark[k]], values, mean).max())
+                # On small images more nodes cost nothing: there the reference is made exact, not just good enough.
+                cheap = convolver.nodes(2 * cuts) <= 4 * planning.NODES_A_BAND
+                if doubts[k] > tolerance / (100 if cheap else 10) and 2 * cuts <= planning.MOST_CUTS:
+                    jobs[k] = replace(jobs[k], plan=replace(jobs[k].plan, cuts=2 * cuts))
+                    again.append(k)
+        todo = again
+    return jobs, references, doubts
+
+
+def _lobe(job: Job) -> Lobe:
+    assert job.lobe is not None
+    return job.lobe
+
+
+def _exact(convolver: Convolver, jobs: Sequence[Job], group: Sequence[int], index: Any, cuts: int,
+           tolerance: float) -> list[np.ndarray]:
+    """Exact values of the texels `index[k]` for every job k of a group, in one pass over the source."""
+    return convolver.exact([(_lobe(jobs[k]), jobs[k].shape.directions(index[k])) for k in group], cuts, tolerance)
 
 
 def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np.ndarray, np.ndarray],
-            reference: np.ndarray, seconds: float) -> Level:
+            reference: np.ndarray, doubt: float) -> Level:
     index = np.concatenate(sample)
-    solid = job.shape.solid_angles()
-    flat = texels.reshape(-1, 3)
-    mean = float((flat * solid[:, None]).sum() / (3 * solid.sum()))
-    error, worst, rmse = statement(flat[index], reference, sample, solid[index], mean, job.shape.count)
+    mean = job.shape.mean(texels)
+    error, worst, rmse = statement(texels.reshape(-1, 3)[index], reference, sample, job.shape.solid_angles(index), mean,
+                                   job.shape.count)
     # A mean over texels is made and checked in float64, and rounded once; elsewhere rounding has its own part.
     rounding = 0.0 if mean == 0 else ROUNDING[64 if job.lobe is None else convolver.precision]
-    if mean > 0 and job.lobe and job.lobe.alpha > planning.SHARP_ENOUGH and not convolver.constant:
-        rounding += planning.KINK_ERROR * convolver.texel / job.plan.cuts**2  # what the reference may be off by
-    if job.lobe is None:
-        method, pairs = "texel-mean", 0
-    else:
+    if mean > 0 and not convolver.constant:
+        rounding += doubt
+    method, pairs = "texel-mean", 0
+    if job.lobe:
         method = f"anterpolated-{job.plan.grid}"
         pairs = planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha)
-    scaled = (texels.astype(np.float64) / convolver.scale).astype(np.float32)
+    scaled = (texels * (1 / convolver.scale)).astype(np.float32)  # a power of two: exact
     return Level(scaled, job.plan.roughness, error + rounding, worst + rounding, rmse, method, job.plan.grid, pairs,
-                 seconds)
+                 seconds=0.0)
 
 
 @dataclass(frozen=True)
@@ -194,8 +228,8 @@ class Lighting:
     sh: np.ndarray
     sh_error: float
     energy_kept: tuple[float, ...]
-    coverage: tuple[np.ndarray, ...]
-    latlong_coverage: tuple[np.ndarray, ...]
+    coverage: tuple[Level, ...]
+    latlong_coverage: tuple[Level, ...]
     seconds: float
 
 
@@ -211,19 +245,21 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
     everything = [*jobs, *wide, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance)]
     levels = run_jobs(convolver, everything, recipe.tolerance)
     sh, sh_error = convolver.harmonics()
-    kept = tuple(_energy(level.texels) / convolver.energy - 1 if convolver.energy > 0 else 0.0
-                 for level in levels[:len(jobs)])
-    coverage: tuple[np.ndarray, ...] = ()
-    wide_coverage: tuple[np.ndarray, ...] = ()
+    kept = tuple(job.shape.mean(level.texels) / convolver.mean - 1 if convolver.mean > 0 else 0.0
+                 for job, level in zip(jobs, levels[:len(jobs)], strict=True))
+    coverage: list[Level] = []
     if env.coverage is not None:
+        # Coverage is light of one channel: the same chain, the same statement.
         grey = np.repeat(env.coverage[..., None], 3, -1)
-        mean = float(np.average(env.coverage, weights=_source_weights(env)))
-        as_light = replace(env, texels=grey, coverage=None, statistics={"mean": [mean] * 3})
-        alpha = light(device, as_light, recipe, latlong=latlong, seed=seed, progress=progress)
-        coverage = tuple(level.texels[..., 0] for level in alpha.levels)
-        wide_coverage = tuple(level.texels[..., 0] for level in alpha.latlongs)
-    return Lighting(tuple(levels[:len(jobs)]), tuple(levels[len(jobs):-1]), levels[-1], sh, sh_error, kept, coverage,
-                    wide_coverage, time.perf_counter() - begin)
+        share = float(np.average(env.coverage, weights=_source_weights(env)))
+        as_light = replace(env, texels=grey, coverage=None, statistics={"mean": [share] * 3})
+        convolver = Convolver(device, as_light, precision=convolver.precision, seed=seed, progress=progress)
+        jobs = chain_jobs(convolver, recipe)
+        wide = chain_jobs(convolver, recipe, latlong=True) if latlong else []
+        coverage = run_jobs(convolver, [*jobs, *wide], recipe.tolerance)
+    n = len(jobs)
+    return Lighting(tuple(levels[:n]), tuple(levels[n:-1]), levels[-1], sh, sh_error, kept, tuple(coverage[:n]),
+                    tuple(coverage[n:]), time.perf_counter() - begin)
 
 
 def _source_weights(env: Environment) -> np.ndarray:
@@ -232,12 +268,6 @@ def _source_weights(env: Environment) -> np.ndarray:
     if env.kind == "latlong":
         return np.broadcast_to(latlong_solid_angles(*env.coverage.shape)[:, None], env.coverage.shape)
     return np.broadcast_to(cube_solid_angles(env.coverage.shape[1]), env.coverage.shape)
-
-
-def _energy(texels: np.ndarray) -> float:
-    """∫ L dω over a cube, all channels together."""
-    omega = Shape(False, texels.shape[1]).solid_angles().reshape(texels.shape[:3])
-    return float(np.einsum("fij,fijc->", omega, texels, dtype=np.float64))
 
 
 def prefilter(source: Any, *, size: int = 256, min_size: int = 16, ndf: str | Model = "ggx",

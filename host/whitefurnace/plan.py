@@ -1,4 +1,5 @@
-"""Recipe and source -> the work: source grids, cuts of texels, launches, bytes; chosen by the tolerance."""
+"""Recipe and source -> the work: source grids, cuts of texels, precision and lobe evaluations that a tolerance
+needs; the sizes of launches and lists that keep memory and rounding bounded."""
 from __future__ import annotations
 
 import math
@@ -39,18 +40,6 @@ NEAR_BRIGHT = 64
 """Further texels, those nearest the brightest sources, where an error hides from a uniform draw."""
 
 
-def bright_cuts(texel: float, alpha: float, tolerance: float, share: float) -> int:
-    """Nodes an edge of a bright texel that holds `share` of all energy, a power of two.
-
-    Where it sets, the kink of (n·l)₊ costs share·texel/(8 cuts²) of the mean; texels a thousand times darker
-    than the mean are held to the tolerance too, so the factor is 10³/8. Sharp lobes carry nothing there.
-    """
-    if alpha <= SHARP_ENOUGH:
-        return 2
-    wanted = math.sqrt(125 * share * texel / tolerance)
-    return 2 ** min(max(1, math.ceil(math.log2(max(wanted, 1e-9)))), 9)
-
-
 def precision_for(tolerance: float) -> int:
     """Working precision: float32 leaves up to 3e-5 on dark texels, so tight tolerances take float64."""
     return 64 if tolerance < 1e-4 else 32
@@ -82,7 +71,7 @@ class LevelPlan:
 
 def pairs_of(outputs: int, grid: int, alpha: float) -> int:
     """Lobe evaluations of `outputs` directions over a grid, as its split leaves them."""
-    split = split_for(grid, alpha)
+    split = split_for(grid, alpha) if grid else None
     if split is None:
         return outputs * 6 * grid**2
     return int(outputs * 6 * (grid**2 * split.q1 / 4 + split.grid**2))
@@ -95,28 +84,46 @@ def grid_size(alpha: float, tolerance: float) -> int:
     return min(max(8 * math.ceil(n / 8), 8), LARGEST_GRID)
 
 
-KINK_ERROR = 0.021
-"""Error of midpoints over texels of 1 radian across the kink of (n·l)₊, on the hardest image measured."""
+SHARP_ENOUGH = 0.1
+"""Lobes up to this α carry too little near the horizon for its kink to be seen."""
 
-SHARP_ENOUGH = 0.05
-"""Lobes up to this α carry less than a hundredth of their weight near the horizon."""
+MOST_CUTS = 64
+"""Where the search for converged reference nodes ends: 4096 nodes a texel."""
 
 
 def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0) -> int:
-    """Quadrature nodes a texel edge so that integrating a lobe over a texel of angle `texel` errs < tolerance/10.
+    """Quadrature nodes a texel edge to begin with, so that integrating a lobe over a texel of angle `texel` errs
+    less than tolerance/10.
 
     Midpoints (1) leave 1.3e-3·(texel/α/.34)² (measured: 1.3e-3 at .34); pairs of Gauss points in m cells an
     edge leave about 1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this bounds by its fourth power. The
-    kink of (n·l)₊ costs a texel with `share` of all energy share·texel/(8 cuts²) where it sets, and a whole
-    image KINK_ERROR·texel/cuts², which a certificate adds to its statement.
+    kink of (n·l)₊ costs a texel with `share` of all energy share·texel/(8 cuts²) where it sets; what a whole
+    panel costs that sets at once no formula says: a certificate doubles the cuts until nothing changes.
     """
     x = texel / alpha / 0.34
     kink = math.sqrt(2.5 * share * texel / tolerance)
-    horizon = math.sqrt(7 * KINK_ERROR * texel / tolerance) if alpha > SHARP_ENOUGH else 0.0
-    if 1.3e-3 * x * x <= tolerance / 20 and kink <= 1 and horizon <= 1:
+    if 1.3e-3 * x * x <= tolerance / 10 and kink <= 1:
         return 1
-    cells = max(x * (5e-4 / tolerance) ** 0.25, kink / 2, horizon / 2)
+    cells = max(x * (5e-4 / tolerance) ** 0.25, kink / 2)
     return 2 * min(max(1, math.ceil(cells)), 512)
+
+
+def cuts_error(texel: float, alpha: float, cuts: int) -> float:
+    """What `cuts` nodes an edge leave of a smooth lobe, by the laws of `cuts_for`."""
+    x = texel / alpha / 0.34
+    return 1.3e-3 * x * x if cuts == 1 else 2.6e-5 * (2 * x / cuts) ** 4
+
+
+def bright_cuts(texel: float, alpha: float, tolerance: float, share: float) -> int:
+    """Nodes an edge of a bright texel that holds `share` of all energy, a power of two.
+
+    Where it sets, the kink of (n·l)₊ costs share·texel/(8 cuts²) of the mean; texels a thousand times darker
+    than the mean are held to the tolerance too, so the factor is 10³/8. Sharp lobes carry nothing there.
+    """
+    if alpha <= SHARP_ENOUGH:
+        return 2
+    wanted = math.sqrt(125 * share * texel / tolerance)
+    return 2 ** min(max(1, math.ceil(math.log2(max(wanted, 1e-9)))), 9)
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from whitefurnace.catalogue import Model, model
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
 
 QUALITIES = {"draft": 1e-2, "normal": 1e-3, "reference": 2e-5}
-SIZE_RANGE = (1, 4096)
+SIZE_RANGE = (1, 2048)
 TOLERANCE_RANGE = (1e-5, 0.5)
 IRRADIANCE_SIZE = 32
 DFG_SIZE = 128

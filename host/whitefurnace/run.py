@@ -12,7 +12,7 @@ from whitefurnace import source
 from whitefurnace.catalogue import Integral, Model, integral, model
 from whitefurnace.catalogue.rule import LADDER, Rule
 from whitefurnace.device import Device, choose_device
-from whitefurnace.errors import UnsupportedError, UsageError, nearest
+from whitefurnace.errors import CheckError, UnsupportedError, UsageError, nearest
 from whitefurnace.recipe import Chosen, chosen
 
 CELLS_A_LAUNCH = 1 << 16
@@ -159,8 +159,10 @@ def _climb(device: Device, entry: Integral, slots: Mapping[str, Chosen], cells: 
         rounding = ROUNDING[precision] * float(np.abs(fine).max())
         error = float(np.abs(fine.astype(np.float64) - coarse).max())
         coarse = fine
-        if not error > max(tolerance - rounding, rounding):
+        if error <= max(tolerance - rounding, rounding):
             break
+    if not np.isfinite(error):
+        raise CheckError(f"integral {entry.name} is not finite for some of these parameters in float{precision}")
     return coarse, error + ROUNDING[precision] * float(np.abs(coarse).max()), rule, spent * cells.shape[1]
 
 
@@ -190,7 +192,7 @@ def _sum(device: Device, entry: Integral, models: Mapping[str, Model], cells: np
 
 def dfg(size: int = 128, *, ndf: str | Model = "ggx", masking: str | Model = "smith",
         tolerance: float = 5e-6, precision: int = 32, device: Device | str | None = None) -> Integrated:
-    """The split-sum table: `values` (size, size, 2) float32 as [y, x, (scale, bias)].
+    """The split-sum table: `values` (size, size, 2), float32 or float64 by `precision`, as [y, x, (scale, bias)].
 
     x is n·v = (x + ½)/size, y perceptual roughness r = (y + ½)/size, row 0 smoothest, α = r². E(v; F0) =
     F0·scale + bias for Schlick's Fresnel with F90 = 1. Raises as `integrate` does.
@@ -207,7 +209,7 @@ def dfg(size: int = 128, *, ndf: str | Model = "ggx", masking: str | Model = "sm
     parameters: dict[str, Any] = {"NoV": axis[None, :], **columns}
     result = integrate("dfg", ndf=choice.model, masking=masking, tolerance=tolerance, precision=precision,
                        device=device, **parameters)
-    return Integrated(np.ascontiguousarray(result.values, np.float32), result.error, result.evaluations,
+    return Integrated(np.ascontiguousarray(result.values), result.error, result.evaluations,
                       result.seconds, result.rule)
 
 

@@ -22,7 +22,7 @@ FUNCTIONS = {
 
 @dataclass(frozen=True)
 class Source:
-    """A program's text, its digest (sha256 hex) and the values it was specialized for."""
+    """A program's text and its digest (sha256 hex)."""
 
     text: str
     digest: str

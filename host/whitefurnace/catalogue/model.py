@@ -69,4 +69,3 @@ class Integral:
     half_angle: bool
     view: bool
     about: str
-    component_names: tuple[str, ...] = ()

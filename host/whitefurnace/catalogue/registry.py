@@ -44,7 +44,7 @@ INTEGRALS = {
         Integral("albedo", "Directional albedo", 1, ("NDF_D", "MASKING_G", "FRESNEL_F"), True, True,
                  "E(v) = ∫ f(l, v)(n·l) dω"),
         Integral("dfg", "Split-sum pair", 2, ("NDF_D", "MASKING_G"), True, True,
-                 "(A, B) with E(v; F0) = F0·A + B, Schlick's F with F90 = 1", ("scale", "bias")),
+                 "(A, B) with E(v; F0) = F0·A + B, Schlick's F with F90 = 1"),
     )
 }
 

@@ -14,8 +14,9 @@ from whitefurnace.errors import FileError
 
 class Transaction:
     """Several files that appear together or not at all: each is staged beside its target, and `commit` renames
-    them in the order they were staged. Leaving the block without `commit`, for whatever reason, removes what
-    was staged and leaves every target as it was."""
+    them in the order they were staged. Leaving the block before the first rename, for whatever reason, removes
+    what was staged and leaves every target as it was; stopped between two renames, what is still staged stays,
+    the manifest with it, and tells the next run whose the renamed files are."""
 
     def __init__(self) -> None:
         self._targets: list[Path] = []

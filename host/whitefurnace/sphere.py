@@ -1,0 +1,172 @@
+"""The sphere in numpy: where texels and grid nodes lie, the order that keeps neighbours together, and the tables
+of quadrature nodes that the kernels read. Float64 throughout; `kernels/sphere.clh` says the same to a device."""
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from whitefurnace import plan as planning
+from whitefurnace.catalogue.rule import gauss
+from whitefurnace.environments import cube_solid_angles, latlong_solid_angles
+
+BLOCK = 16
+"""Sources that `convolve_near` takes or leaves together."""
+
+
+def cube_directions(face: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
+    """(3, m) unit directions of face coordinates in [-1, 1], in the GL-direct layout."""
+    one = np.ones_like(s)
+    d = np.choose(face, [[one, -t, -s], [-one, -t, s], [s, one, t], [s, -one, -t], [s, -t, one], [-s, -t, -one]])
+    return d / np.sqrt((d * d).sum(0))
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Where a level is evaluated: the texel centres of a cube or of a lat-long image."""
+
+    latlong: bool
+    size: int  # face edge, or height of the lat-long
+
+    @property
+    def dims(self) -> tuple[int, ...]:
+        return (self.size, 2 * self.size) if self.latlong else (6, self.size, self.size)
+
+    @property
+    def count(self) -> int:
+        return int(np.prod(self.dims))
+
+    def directions(self, index: np.ndarray | None = None) -> np.ndarray:
+        """(3, m) unit directions of texel centres, of all texels or of those with the flat indices given."""
+        index = np.arange(self.count) if index is None else index
+        if self.latlong:
+            return latlong_centres(self.size, 2 * self.size, index)
+        return cube_centres(self.size, index)
+
+    def solid_angles(self, index: np.ndarray | None = None) -> np.ndarray:
+        """(m,) solid angles, of all texels or of those given."""
+        if self.latlong:
+            omega = latlong_solid_angles(self.size, 2 * self.size)
+            return np.repeat(omega, 2 * self.size) if index is None else omega[index // (2 * self.size)]
+        omega = cube_solid_angles(self.size).ravel()
+        return np.tile(omega, 6) if index is None else omega[index % self.size**2]
+
+    def mean(self, texels: np.ndarray) -> float:
+        """Mean of (dims, 3) texels over the sphere, all channels together."""
+        if self.latlong:
+            weights = latlong_solid_angles(self.size, 2 * self.size)
+            return float(weights @ texels.sum((1, 2), dtype=np.float64)) / (12 * math.pi)
+        weights = cube_solid_angles(self.size)
+        return sum(float((weights * face.sum(-1, dtype=np.float64)).sum()) for face in texels) / (12 * math.pi)
+
+    def tiled(self) -> np.ndarray:
+        """Flat indices in an order that keeps neighbours together: tiles of 4 × 4 within tiles of 8 × 8."""
+        index = np.arange(self.count, dtype=np.int32).reshape(-1, *self.dims[-2:])
+        planes, height, width = index.shape
+        if height % 8 or width % 8:
+            return index.ravel()
+        return index.reshape(planes, height // 8, 2, 4, width // 8, 2, 4).transpose(0, 1, 4, 2, 5, 3, 6).ravel()
+
+
+def cube_centres(size: int, index: np.ndarray) -> np.ndarray:
+    """(3, m) directions of the texel centres of a cube, by flat index."""
+    face, i, j = index // size**2, index // size % size, index % size
+    return cube_directions(face, (2 * j + 1) / size - 1, (2 * i + 1) / size - 1)
+
+
+def latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
+    """(3, m) directions of the texel centres of a lat-long image, by flat index."""
+    theta = (index // columns + 0.5) * math.pi / rows
+    phi = (index % columns + 0.5) * 2 * math.pi / columns - math.pi
+    return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)])
+
+
+def grid_tangents(n: int) -> np.ndarray:
+    """(n,) face coordinates of the nodes of an equiangular grid."""
+    return np.tan(((2 * np.arange(n) + 1) / n - 1) * math.pi / 4)
+
+
+@cache
+def block_bounds(n: int) -> np.ndarray:
+    """(6 n²/64, 5, 4): bounds of every 64 sources of the n × n grid in the order of `grid_list`, then of each
+    BLOCK of them."""
+    index, u = Shape(False, n).tiled(), grid_tangents(n)
+    directions = cube_directions(index // n**2, u[index % n], u[index // n % n])
+    outer, inner = bounds(directions, 4 * BLOCK), bounds(directions, BLOCK)
+    return np.concatenate([outer[:, None], inner.reshape(-1, 4, 4)], 1)
+
+
+def bounds(directions: np.ndarray, count: int) -> np.ndarray:
+    """(m, 4): centre and largest chord to it, of each `count` consecutive directions (3, m·count)."""
+    d = directions.reshape(3, -1, count)
+    centre = d.mean(2)
+    radius = np.sqrt(((d - centre[..., None]) ** 2).sum(0).max(1))
+    return np.concatenate([centre, radius[None] * (1 + 1e-6) + 1e-6]).T.copy()
+
+
+def composite(cuts: int) -> tuple[np.ndarray, np.ndarray]:
+    """cuts/2 cells of two Gauss points each on [0, 1]."""
+    cells = cuts // 2
+    x, w = gauss(2)
+    nodes = (np.arange(cells)[:, None] + x) / cells
+    return nodes.ravel(), np.tile(w / cells, cells)
+
+
+def latlong_tables(rows: int, columns: int, x: np.ndarray, w: np.ndarray,
+                    rotation: float) -> tuple[np.ndarray, np.ndarray]:
+    """(cos θ, sin θ, weight) by refined row, each row's weights summing to cos θ0 - cos θ1; and
+    (cos φ, sin φ, weight) by refined column."""
+    theta = (np.arange(rows)[:, None] + x) * (math.pi / rows)
+    weight = np.sin(theta) * w
+    weight *= (-np.diff(np.cos(np.arange(rows + 1) * math.pi / rows)) / weight.sum(1))[:, None]
+    phi = (np.arange(columns)[:, None] + x) * (2 * math.pi / columns) - math.pi + rotation
+    across = np.broadcast_to(w * (2 * math.pi / columns), phi.shape)
+    return (np.stack([np.cos(theta), np.sin(theta), weight], -1).reshape(-1, 3),
+            np.stack([np.cos(phi), np.sin(phi), across], -1).reshape(-1, 3))
+
+
+def cube_tables(size: int, x: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(coordinate, weight, 0) by refined row; the same by column, followed by the factors (size, size) that bring
+    each texel's nodes to its exact solid angle. Many nodes get there to 1e-9 by themselves: factors of 1."""
+    s = ((np.arange(size)[:, None] + x) * (2 / size) - 1).ravel()
+    weight = np.tile(w * (2 / size), size)
+    correction = np.ones((size, size))
+    if len(s) <= 1024:
+        density = weight[:, None] * weight * (1 + s[:, None] ** 2 + s**2) ** -1.5
+        correction = cube_solid_angles(size) / density.reshape(size, len(x), size, len(x)).sum((1, 3))
+    table = np.stack([s, weight, np.zeros_like(s)], 1)
+    return table, np.concatenate([table.ravel(), correction.ravel()])
+
+
+def row_edges(rows: int, real: Any) -> np.ndarray:
+    """(cos θ, cot θ) of the rows + 1 edges; the poles' cotangents are ±1e300 (1e30 in float32), never used
+    but as a bound."""
+    theta = np.arange(rows + 1) * math.pi / rows
+    cosine, sine = np.cos(theta), np.sin(theta)
+    if rows % 2 == 0:
+        cosine[rows // 2] = 0.0
+    sine[[0, -1]] = 1e-30
+    return np.stack([cosine, cosine / sine], 1).astype(real)
+
+
+@cache
+def coarsening(fine: int, coarse: int, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The interpolation matrix (fine, coarse) between equiangular nodes, and for each coarse node the range
+    [first, last) of fine nodes it takes part in."""
+    order = min(planning.ORDER, coarse)
+    x = (2 * np.arange(fine) + 1) / fine / 2 * coarse - 0.5  # in coarse node numbers
+    start = np.clip(np.floor(x).astype(int) - (order // 2 - 1), 0, coarse - order)
+    matrix = np.zeros((fine, coarse))
+    for a in range(order):
+        weight = np.ones(fine)
+        for b in range(order):
+            if b != a:
+                weight *= (x - (start + b)) / (a - b)
+        matrix[np.arange(fine), start + a] = weight
+    touched = (np.arange(coarse) >= start[:, None]) & (np.arange(coarse) < start[:, None] + order)
+    first = touched.argmax(0)
+    last = fine - touched[::-1].argmax(0)
+    return matrix.astype(kind), first.astype(np.int32), last.astype(np.int32)
