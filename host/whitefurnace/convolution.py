@@ -335,7 +335,8 @@ class Convolver:
         coefficients = np.zeros(28)
         for listed, count, share in self._bands(cuts):
             self.progress("exact integrals", share)
-            coefficients += self._harmonic_sums(listed, count)
+            if cuts not in self._harmonics:
+                coefficients += self._harmonic_sums(listed, count)
             for lobe, directions_on, sums in jobs:
                 sums += self._list_sums(lobe, listed, count, directions_on)
         results = []
@@ -344,10 +345,11 @@ class Convolver:
             for listed in self._bright_lists(lobe, tolerance, finer=2):
                 value += self._list_sums(lobe, listed, listed.shape[0], directions_on)[:3] / lobe.norm
             results.append(value.T[:directions.shape[1]] + self.base)
-        for listed in self._bright_lists(COSINE, 1e-3):
-            coefficients[:27] += self._harmonic_sums(listed, listed.shape[0])[:27]
-        coefficients[:3] += self.base * 2 * math.sqrt(math.pi)  # ∫ Y00 dω
-        self._harmonics[cuts] = coefficients
+        if cuts not in self._harmonics:
+            for listed in self._bright_lists(COSINE, 1e-3):
+                coefficients[:27] += self._harmonic_sums(listed, listed.shape[0])[:27]
+            coefficients[:3] += self.base * 2 * math.sqrt(math.pi)  # ∫ Y00 dω
+            self._harmonics[cuts] = coefficients
         return results
 
     def _list_sums(self, lobe: Lobe, listed: Buffer, count: int, block: Buffer) -> np.ndarray:
@@ -475,7 +477,7 @@ class Convolver:
             index = np.arange(first, min(first + (1 << 18), shape.count))
             best = np.concatenate([best, index])
             closeness = np.concatenate([closeness, (targets @ shape.directions(index)).max(0)])
-            keep = np.argsort(-closeness, kind="stable")[:planning.NEAR_BRIGHT]
+            keep = np.argpartition(-closeness, planning.NEAR_BRIGHT)[:planning.NEAR_BRIGHT]
             best, closeness = best[keep], closeness[keep]
         return np.sort(best)
 

@@ -17,11 +17,16 @@ BLOCK = 16
 """Sources that `convolve_near` takes or leaves together."""
 
 
+# Axis, right and down of each face, +X -X +Y -Y +Z -Z: the direction of (s, t) is axis + s·right + t·down.
+AXIS = np.array([[1, -1, 0, 0, 0, 0], [0, 0, 1, -1, 0, 0], [0, 0, 0, 0, 1, -1]], np.float64)
+RIGHT = np.array([[0, 0, 1, 1, 1, -1], [0, 0, 0, 0, 0, 0], [-1, 1, 0, 0, 0, 0]], np.float64)
+DOWN = np.array([[0, 0, 0, 0, 0, 0], [-1, -1, 0, 0, -1, -1], [0, 0, 1, -1, 0, 0]], np.float64)
+
+
 def cube_directions(face: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
     """(3, m) unit directions of face coordinates in [-1, 1], in the GL-direct layout."""
-    one = np.ones_like(s)
-    d = np.choose(face, [[one, -t, -s], [-one, -t, s], [s, one, t], [s, -one, -t], [s, -t, one], [-s, -t, -one]])
-    return d / np.sqrt((d * d).sum(0))
+    d = AXIS[:, face] + s * RIGHT[:, face] + t * DOWN[:, face]
+    return d / np.sqrt(1 + s * s + t * t)
 
 
 @dataclass(frozen=True)
