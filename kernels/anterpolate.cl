@@ -8,12 +8,12 @@
 #define ORDER 4
 #endif
 
-// Node (row i, column j) of faces × rows·cuts × columns·cuts, in order from `first`: the list `convolve` reads.
-__kernel void nodes(__global scalar *restrict list, const long first, const int count, TEXELS_PARAMETERS) {
+// Nodes of faces × rows·cuts × columns·cuts, whole rows of them from `first_row`: the list `convolve` reads.
+__kernel void nodes(__global scalar *restrict list, const int first_row, const int count, TEXELS_PARAMETERS) {
   const int g = get_global_id(0);
   if (g >= count) return;
-  const long width = columns * cuts, height = rows * cuts, index = first + g;  // 16K × 8K texels of 4 × 4 nodes
-  const int face = index / (width * height), i = index / width % height, j = index % width;
+  const int width = columns * cuts, height = rows * cuts, row = first_row + g / width;
+  const int face = row / height, i = row - face * height, j = g % width;
   vec3 d;
   int texel;
   const scalar w = texel_node(face, i, j, &d, &texel, TEXELS_VALUES);

@@ -242,14 +242,15 @@ class Convolver:
         return self.faces * self.rows * self.columns * cuts * cuts
 
     def _bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
-        """Every node of the clipped source, in bands: (list, nodes in it, share done)."""
-        total = self.nodes(cuts)
-        listed = self.device.empty((min(planning.NODES_A_BAND, total), 8), self.kind)
-        for first in range(0, total, planning.NODES_A_BAND):
-            count = min(planning.NODES_A_BAND, total - first)
+        """Every node of the clipped source, in bands of whole rows: (list, nodes in it, share done)."""
+        width, rows = self.columns * cuts, self.faces * self.rows * cuts
+        band = min(max(planning.NODES_A_BAND // width, 1), rows)
+        listed = self.device.empty((band * width, 8), self.kind)
+        for first in range(0, rows, band):
+            count = min(band, rows - first) * width
             self._launch(self._texel_kernel("nodes"), count,
-                         (listed, np.int64(first), np.int32(count), *self._texel_arguments(cuts, self._clipped)))
-            yield listed, count, (first + count) / total
+                         (listed, np.int32(first), np.int32(count), *self._texel_arguments(cuts, self._clipped)))
+            yield listed, count, min(first + band, rows) / rows
 
     # ------------------------------------------------------------------------------------------- lobes
 
@@ -324,7 +325,7 @@ class Convolver:
         """For each (lobe, directions (3, m)): the integral over every texel, (m, 3) float64, in one pass.
 
         Bright texels are cut twice as fine as in `convolve`. The spherical harmonics of the same nodes
-        are kept for `harmonics`.
+        are kept where `harmonics` will ask for them.
         """
         jobs = []
         step = self._step * self.device.local_size
@@ -333,9 +334,10 @@ class Convolver:
             block = np.pad(directions, ((0, 0), (0, padded - directions.shape[1])), mode="edge")
             jobs.append((lobe, self.device.array(block.astype(self.kind)), np.zeros((4, padded))))
         coefficients = np.zeros(28)
+        wants_harmonics = cuts in self._harmonic_cuts and cuts not in self._harmonics
         for listed, count, share in self._bands(cuts):
             self.progress("exact integrals", share)
-            if cuts not in self._harmonics:
+            if wants_harmonics:
                 coefficients += self._harmonic_sums(listed, count)
             for lobe, directions_on, sums in jobs:
                 sums += self._list_sums(lobe, listed, count, directions_on)
@@ -345,7 +347,7 @@ class Convolver:
             for listed in self._bright_lists(lobe, tolerance, finer=2):
                 value += self._list_sums(lobe, listed, listed.shape[0], directions_on)[:3] / lobe.norm
             results.append(value.T[:directions.shape[1]] + self.base)
-        if cuts not in self._harmonics:
+        if wants_harmonics:
             for listed in self._bright_lists(COSINE, 1e-3):
                 coefficients[:27] += self._harmonic_sums(listed, listed.shape[0])[:27]
             coefficients[:3] += self.base * 2 * math.sqrt(math.pi)  # ∫ Y00 dω
@@ -366,12 +368,17 @@ class Convolver:
                      (partial, np.int32(count), np.int32(HARMONICS_CHUNK), listed))
         return partial.read().sum(0, dtype=np.float64)
 
+    @property
+    def _harmonic_cuts(self) -> tuple[int, int]:
+        """Nodes a texel edge for spherical harmonics, and half as many."""
+        cuts = 2 * math.ceil(self.texel / 0.05)  # pairs of Gauss points on .05 rad: 2e-8 for these polynomials
+        return cuts, 1 if cuts == 2 else 2 * (cuts // 4)
+
     def harmonics(self) -> tuple[np.ndarray, float]:
         """Radiance coefficients (9, 3) in float64 from nodes of every texel, and their error over the largest
         L00: the difference to half as many nodes an edge, which bounds the finer rule's, and float32's part."""
-        cuts = 2 * math.ceil(self.texel / 0.05)  # pairs of Gauss points on .05 rad: 2e-8 for these polynomials
-        fewer = 1 if cuts == 2 else 2 * (cuts // 4)
-        for c in (cuts, fewer):
+        cuts, fewer = self._harmonic_cuts
+        for c in self._harmonic_cuts:
             if c not in self._harmonics:
                 self.exact([], c)
         sums = self._harmonics[cuts]
