@@ -1,5 +1,5 @@
 // Level 0: the mean radiance of the source over each output texel, by exact areas of overlap. Built in
-// float64 where the device has it: beside a sun 1e5 times the mean, a sliver of 1e-7 of a texel is an error
+// float64: beside a sun 1e5 times the mean, a sliver of 1e-7 of a texel is an error
 // of 1 %, and float32 places edges no better than that.
 
 // ---- a lat-long source on a cube face, by Green's theorem ------------------------------------------------
@@ -8,8 +8,8 @@
 // tan(latitude) = A cos ψ, ψ = φ - φ0, on which y = A cos ψ / √(1 + A² cos² ψ), and
 // ∫ y dψ = asin(A sin ψ / √(1 + A²)): closed form between the crossings of rows and columns.
 
-// above: [rows of the band][columns][3], ∫ L dy from the north pole to the top of each row (to the south pole
-// taken away when `total` is given: C may shift by any function of φ alone, and must vanish at the face's pole).
+// above: [rows of the band][columns][3], ∫ L dy from the north pole to the top of each row; carry: [columns][3], the
+// same at the end of the band, for the next.
 __kernel void accumulate_rows(__global scalar *restrict above, __global scalar *restrict carry, const int columns,
                               const int first_row, const int last_row, __global const scalar *restrict row_edge,
                               __global const float *restrict radiance) {
@@ -23,8 +23,8 @@ __kernel void accumulate_rows(__global scalar *restrict above, __global scalar *
   carry[g] = sum;
 }
 
-// row_edge: (cos θ, cot θ) of each of the rows + 1 row edges. south: 1 for the -Y face, where C is taken from
-// the south pole by subtracting `total`. Adds to edge[2][size + 1][size][3]: the edges t = const by line and
+// row_edge: (cos θ, cot θ) of each of the rows + 1 row edges. total: [columns][3], ∫ L dy from pole to pole, taken from C
+// on the -Y face: C may shift by any function of φ alone, and must vanish at the face's pole. Adds to edge[2][size + 1][size][3]: the edges t = const by line and
 // column, then the edges s = const.
 __kernel void cut_edges(__global scalar *restrict edge, const int size, const int face, const int rows,
                         const int columns, const scalar rotation, const int first_row, const int last_row,

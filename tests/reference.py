@@ -16,6 +16,17 @@ def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
     return (x + 1) / 2, w / 2
 
 
+def cube_directions(n: int) -> np.ndarray:
+    """(6, n, n, 3) unit directions of texel centres, by the text of the convention: +X = (1,-t,-s), -X = (-1,-t,s),
+    +Y = (s,1,t), -Y = (s,-1,-t), +Z = (s,-t,1), -Z = (-s,-t,-1)."""
+    middle = 2 * (np.arange(n) + 0.5) / n - 1
+    t, s = np.meshgrid(middle, middle, indexing="ij")
+    one = np.ones_like(s)
+    faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
+    d = np.array([np.stack(face, -1) for face in faces])
+    return d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
 def texel_nodes(texels: np.ndarray, rotation: float, cuts: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Nodes of cuts x cuts Gauss points in every texel: directions (N, 3), solid angles (N,), texel indices (N,).
 

@@ -20,6 +20,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from reference import cube_directions
 from whitefurnace import bake, prefilter
 from whitefurnace.cli import main
 from whitefurnace.environments import cube_solid_angles
@@ -104,16 +105,6 @@ def read_exr(path: Path):
     pixels, spec = np.asarray(source.read_image("float")), source.spec()
     source.close()
     return pixels, spec
-
-
-def cube_directions(n):
-    """+X = (1,-t,-s), -X = (-1,-t,s), +Y = (s,1,t), -Y = (s,-1,-t), +Z = (s,-t,1), -Z = (-s,-t,-1)."""
-    middle = 2 * (np.arange(n) + 0.5) / n - 1
-    t, s = np.meshgrid(middle, middle, indexing="ij")
-    one = np.ones_like(s)
-    d = np.array([np.stack(f, -1) for f in
-                  [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]])
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 def latlong_directions(h, w):

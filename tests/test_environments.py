@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from reference import cube_directions
 from whitefurnace.environments import (
     LAYOUTS,
     Environment,
@@ -19,17 +20,6 @@ from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import write_exr
 
 N = 8
-
-
-def cube_directions(n):
-    """The direction of every texel from the text of the convention: +X = (1,-t,-s), -X = (-1,-t,s),
-    +Y = (s,1,t), -Y = (s,-1,-t), +Z = (s,-t,1), -Z = (-s,-t,-1); s to the right, t down."""
-    middle = 2 * (np.arange(n) + 0.5) / n - 1
-    t, s = np.meshgrid(middle, middle, indexing="ij")
-    one = np.ones_like(s)
-    faces = [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
-    d = np.array([np.stack(face, axis=-1) for face in faces])
-    return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
 def latlong_directions(h, w):

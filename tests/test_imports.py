@@ -26,7 +26,7 @@ ALLOWED: dict[str, set[str]] = {
     "certificate": set(),
     "sphere": {"catalogue", "plan", "environments"},
     "convolution": {"errors", "catalogue", "recipe", "source", "plan", "device", "environments", "sphere"},
-    "lighting": {"errors", "catalogue", "recipe", "plan", "device", "environments", "certificate", "sphere",
+    "lighting": {"errors", "catalogue", "recipe", "plan", "device", "environments", "run", "certificate", "sphere",
                  "convolution"},
     "baking": {"errors", "version", "catalogue", "recipe", "source", "plan", "device", "files", "engines",
                "environments", "run", "lighting"},

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from reference import exact_lobe, gauss, ggx_lobe, texel_nodes
+from reference import cube_directions, exact_lobe, gauss, ggx_lobe, texel_nodes
 from whitefurnace import harmonics, prefilter
 from whitefurnace.environments import cube_solid_angles, environment
 from whitefurnace.files import write_exr
@@ -32,16 +32,6 @@ def rule(alpha):
         return gauss(8), gauss(8)
     x, w = gauss(4)
     return (((np.arange(4)[:, None] + x).ravel() / 4, np.tile(w / 4, 4)), (x, w))
-
-
-def cube_directions(n):
-    """(6 n², 3), by the text of the convention."""
-    middle = 2 * (np.arange(n) + 0.5) / n - 1
-    t, s = np.meshgrid(middle, middle, indexing="ij")
-    one = np.ones_like(s)
-    d = np.array([np.stack(f, -1) for f in
-                  [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]])
-    return (d / np.linalg.norm(d, axis=-1, keepdims=True)).reshape(-1, 3)
 
 
 def strip(theta, theta_r, phi_r, low, width, lobe):
@@ -72,7 +62,7 @@ def matrix(size: int, alpha: float, exactly: tuple[int, ...]) -> np.ndarray:
     cut into 64 cells of 8.
     """
     lobe = ggx_lobe(alpha)
-    d = cube_directions(size)
+    d = cube_directions(size).reshape(-1, 3)
     theta_r, phi_r = np.arccos(d[:, 1]), np.arctan2(d[:, 2], d[:, 0])
     (x_theta, w_theta), (x, w) = rule(alpha)
     dtheta, dphi = math.pi / ROWS, 2 * math.pi / COLUMNS
@@ -181,7 +171,7 @@ def cases(kind: str) -> list[dict]:
 
 def test_the_truth_is_true():
     """The matrix against the plain sum over Gauss nodes of tests/reference.py, and a constant against 1."""
-    d = cube_directions(8)
+    d = cube_directions(8).reshape(-1, 3)
     pick = np.arange(0, len(d), 37)
     pixels = synthetic("panels", 0)
     # The plain sum meets the kink head on: (.13/cuts)²/8 of the slope there, a few texels' worth. At α = .179 the
@@ -254,7 +244,7 @@ def check_real(path: Path, texels: int, **options):
         omega = np.tile(cube_solid_angles(values.shape[1]).ravel(), 6)
         mean = (flat.sum(1) * omega).sum() / (3 * 4 * math.pi)
         index = rng.choice(len(flat), texels, replace=False)
-        d = cube_directions(values.shape[1])[index]
+        d = cube_directions(values.shape[1]).reshape(-1, 3)[index]
         # 2 × 2 Gauss points a texel: at 1K a texel is .34 α of the sharpest lobe, which leaves 3e-5 of it.
         cuts = 2 if r * r > 0.01 else 4
         want = exact_lobe(env.texels, 0.0, d, ggx_lobe(r * r), cuts)

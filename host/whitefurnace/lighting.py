@@ -13,12 +13,13 @@ import numpy as np
 from whitefurnace import plan as planning
 from whitefurnace.catalogue import Model
 from whitefurnace.certificate import statement, texel_errors
-from whitefurnace.convolution import COSINE, ROUNDING, Convolver, Level, Lobe, Progress, ndf_lobe
+from whitefurnace.convolution import COSINE, EXACT_SHARE, ROUNDING, Convolver, Level, Lobe, Progress, ndf_lobe
 from whitefurnace.device import Device, choose_device
 from whitefurnace.environments import Environment, cube_solid_angles, environment, latlong_solid_angles
 from whitefurnace.errors import CheckError, UsageError
 from whitefurnace.plan import LevelPlan
 from whitefurnace.recipe import IRRADIANCE_SIZE, Chain, chain, tolerance_of
+from whitefurnace.run import Integrated
 from whitefurnace.sphere import Shape
 
 
@@ -61,21 +62,12 @@ class Prefiltered:
 
 
 @dataclass(frozen=True)
-class Certified:
-    """An array with its statement: `values`, `error` (p99 of texel errors at 95 % confidence, or for spherical
-    harmonics the largest coefficient error over the largest of L00), `worst`, `rmse`, `evaluations`,
-    `seconds`, `rule`."""
+class Certified(Integrated):
+    """An array with its statement: an `Integrated` whose `error` is the p99 of texel errors at 95 % confidence (for
+    spherical harmonics the largest coefficient error over the largest of L00), with `worst` and `rmse`."""
 
-    values: np.ndarray
-    error: float
     worst: float
     rmse: float
-    evaluations: int
-    seconds: float
-    rule: str
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.values, dtype=dtype) if dtype or copy else self.values
 
 
 @dataclass(frozen=True)
@@ -119,7 +111,7 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
     levels = []
     for k, job in enumerate(jobs):
         begin = time.perf_counter()
-        share = sum(work[:k]) / sum(work), sum(work[:k + 1]) / sum(work)
+        share = tuple(EXACT_SHARE + (1 - EXACT_SHARE) * sum(work[:m]) / sum(work) for m in (k, k + 1))
         level = _stated(convolver, job, _make(convolver, job, tolerance, share), samples[k], references[k], doubts[k])
         before, stuck = math.inf, 0
         while not level.error <= tolerance:  # NaN too
@@ -136,7 +128,7 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
     return levels
 
 
-def _make(convolver: Convolver, job: Job, tolerance: float, share: tuple[float, float]) -> np.ndarray:
+def _make(convolver: Convolver, job: Job, tolerance: float, share: tuple[float, ...]) -> np.ndarray:
     if job.lobe is None:
         return convolver.means(job.shape)
     return convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance, share)
@@ -298,8 +290,8 @@ def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | N
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     convolver = Convolver(_device(device), env, precision=planning.precision_for(bound))
     level = run_jobs(convolver, [irradiance_job(convolver, size, bound)], bound)[0]
-    return Certified(level.texels, level.error, level.worst, level.rmse, level.pairs,
-                     time.perf_counter() - begin, level.method)
+    return Certified(level.texels, level.error, level.pairs, time.perf_counter() - begin, level.method, level.worst,
+                     level.rmse)
 
 
 def harmonics(source: Any, *, rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse",
@@ -310,8 +302,8 @@ def harmonics(source: Any, *, rotate: float = 0.0, exposure: float = 0.0, nonfin
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     convolver = Convolver(_device(device), env)
     values, error = convolver.harmonics()
-    return Certified(values, error, error, error, convolver.faces * convolver.rows * convolver.columns,
-                     time.perf_counter() - begin, "texel-nodes")
+    return Certified(values, error, convolver.faces * convolver.rows * convolver.columns,
+                     time.perf_counter() - begin, "texel-nodes", worst=error, rmse=error)
 
 
 def _device(device: Device | str | None) -> Device:
