@@ -14,7 +14,7 @@ __kernel void nodes(__global scalar *restrict list, const int first_row, const i
   if (g >= count) return;
   const int width = columns * cuts, height = rows * cuts, row = first_row + g / width;
   const int face = row / height, i = row - face * height, j = g % width;
-  vec3 d;
+  xyz d;
   int texel;
   const scalar w = texel_node(face, i, j, &d, &texel, TEXELS_VALUES);
   __global const float *L = radiance + 3 * (size_t)texel;
@@ -30,7 +30,7 @@ __kernel void chosen_nodes(__global scalar *restrict list, const int count, __gl
   if (g >= count * per) return;
   const int k = g / per, a = g % per, index = texels[k];
   const int face = index / (rows * columns), row = index / columns % rows, column = index % columns;
-  vec3 d;
+  xyz d;
   int texel;
   const scalar w = texel_node(face, row * cuts + a / cuts, column * cuts + a % cuts, &d, &texel, TEXELS_VALUES);
   __global scalar *p = list + 8 * (size_t)g;
@@ -66,12 +66,12 @@ __kernel void anterpolate(__global scalar *restrict moments, const int n, const 
   const scalar s0 = gj == 0 ? -2 : tan(u0), s1 = gj == gaps - 1 ? 2 : tan(u1);
   const scalar t0 = gi == 0 ? -2 : tan(v0), t1 = gi == gaps - 1 ? 2 : tan(v1);
 
-  const vec3 centre = unit3(cube_direction(target, tan((u0 + u1) / 2), tan((v0 + v1) / 2)));
+  const xyz centre = unit3(cube_direction(target, tan((u0 + u1) / 2), tan((v0 + v1) / 2)));
   scalar reach = 0;
   for (int k = 0; k < 4; k++) {
-    const vec3 corner = unit3(cube_direction(target, tan(k & 1 ? u1 : u0), tan(k & 2 ? v1 : v0)));
-    const vec3 d = {corner.x - centre.x, corner.y - centre.y, corner.z - centre.z};
-    reach = fmax(reach, dot3(d, d));
+    const xyz corner = unit3(cube_direction(target, tan(k & 1 ? u1 : u0), tan(k & 2 ? v1 : v0)));
+    const xyz d = {corner.x - centre.x, corner.y - centre.y, corner.z - centre.z};
+    reach = fmax(reach, dot_xyz(d, d));
   }
   const scalar radius = 2 * asin(sqrt(reach) / 2) * (scalar)1.0001 + (scalar)2e-6;
 
@@ -92,11 +92,11 @@ __kernel void anterpolate(__global scalar *restrict moments, const int n, const 
     for (int i = box.x; i < box.y; i++) {
       for (int j = box.z; j < box.w; j++) {
         const int column = !TEXELS_WRAP ? j : j < 0 ? j + all : j >= all ? j - all : j;
-        vec3 d;
+        xyz d;
         int texel;
         const scalar w = texel_node(face, i, column, &d, &texel, TEXELS_VALUES);
         if (cube_face(d) != target) continue;
-        const vec3 q = to_face(target, d);
+        const xyz q = to_face(target, d);
         const scalar s = q.x / q.z, t = q.y / q.z;
         if (!(s >= s0 && s < s1 && t >= t0 && t < t1)) continue;
         scalar wu[ORDER], wv[ORDER];
@@ -168,7 +168,7 @@ __kernel void grid_list(__global scalar *restrict list, const int n, __global co
   const int g = get_global_id(0);
   if (g >= 6 * n * n) return;
   const int face = g / (n * n), i = g / n % n, j = g % n;
-  const vec3 d = unit3(cube_direction(face, tangent[j], tangent[i]));
+  const xyz d = unit3(cube_direction(face, tangent[j], tangent[i]));
   __global const scalar *q = grid + 4 * (size_t)g;
   const int block = (face * (n / 8) + i / 8) * (n / 8) + j / 8;
   __global scalar *p = list + 8 * ((size_t)block * 64 + (i % 8 / 4 * 2 + j % 8 / 4) * 16 + i % 4 * 4 + j % 4);

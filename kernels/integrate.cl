@@ -7,23 +7,21 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
   const int g = get_global_id(0);
   if ((g + 1) * W > cells) return;
   CELL_LOAD
-  View v;
-  v.NoV = cell_NoV;
-  v.sin_v = sqrt(one_minus_sqr(v.NoV));
-  v.cot_v = v.NoV / fmax(v.sin_v, (real)1e-30f);
-  v.width = NDF_WIDTH;
+  const View v = view_of(cell_NoV, NDF_WIDTH, NDF_REACH);
+  const real at_v = MASKING_AT(v.NoV);
   real sum[COMPONENTS];
   for (int c = 0; c < COMPONENTS; c++) sum[c] = (real)0;
   for (int k = 0; k < nodes; k++) {
-    const Ring r = ring(v, k >= first, theta[2 * k], theta[2 * k + 1] CELL_VALUES);
+    const Ring r = ring(v, k >= first, theta[2 * k], theta[2 * k + 1]);
     real inner[COMPONENTS];
     for (int c = 0; c < COMPONENTS; c++) inner[c] = (real)0;
     for (int a = 0; a < azimuths; a++) {
       const real cos_phi = cos_0_pi(r.phi_max * phi[2 * a]);
       const real VoM = fmax(v.NoV * r.cos_m + v.sin_v * r.sin_m * cos_phi, (real)0);
-      integrand(inner, phi[2 * a + 1], v, r, VoM CELL_VALUES);
+      const Facet f = {v.NoV, 2 * VoM * r.cos_m - v.NoV, r.cos_m, VoM, at_v};
+      integrand(inner, phi[2 * a + 1], f CELL_VALUES);
     }
-    const real D = NDF_D(r.cos_m, r.sin2_m) * r.weight;
+    const real D = NDF_D(r.cos_m, r.sin2_m) * (r.weight * r.phi_max);
     for (int c = 0; c < COMPONENTS; c++) sum[c] += inner[c] * D;
   }
   for (int c = 0; c < COMPONENTS; c++) STORE(sum[c], g, out + (size_t)c * cells);

@@ -142,16 +142,16 @@ __kernel void mean_latlong(__global float *restrict level, const int height, con
 
 // Keep the part of the polygon with p·n ≥ 0 (Sutherland-Hodgman; the planes hold the origin, so the edges of
 // the result are great circles again).
-static inline int clip(vec3 *p, int count, vec3 n) {
-  vec3 out[MOST];
+static inline int clip(xyz *p, int count, xyz n) {
+  xyz out[MOST];
   int m = 0;
   for (int k = 0; k < count; k++) {
-    const vec3 a = p[k], b = p[k + 1 == count ? 0 : k + 1];
-    const scalar da = dot3(a, n), db = dot3(b, n);
+    const xyz a = p[k], b = p[k + 1 == count ? 0 : k + 1];
+    const scalar da = dot_xyz(a, n), db = dot_xyz(b, n);
     if (da >= 0) out[m++] = a;
     if ((da > 0 && db < 0) || (da < 0 && db > 0)) {
       const scalar t = da / (da - db);
-      const vec3 c = {a.x + t * (b.x - a.x), a.y + t * (b.y - a.y), a.z + t * (b.z - a.z)};
+      const xyz c = {a.x + t * (b.x - a.x), a.y + t * (b.y - a.y), a.z + t * (b.z - a.z)};
       out[m++] = c;
     }
   }
@@ -160,24 +160,24 @@ static inline int clip(vec3 *p, int count, vec3 n) {
 }
 
 // Solid angle of a polygon as a fan of triangles, signed. [VanOosterom1983, eq. 8] Corners need not be unit.
-static inline scalar polygon_solid_angle(const vec3 *p, int count) {
+static inline scalar polygon_solid_angle(const xyz *p, int count) {
   scalar area = 0;
   if (count < 3) return 0;
-  const vec3 a = unit3(p[0]);
-  vec3 b = unit3(p[1]);
+  const xyz a = unit3(p[0]);
+  xyz b = unit3(p[1]);
   for (int k = 2; k < count; k++) {
-    const vec3 c = unit3(p[k]);
+    const xyz c = unit3(p[k]);
     // Differences first: the triple product of nearly equal unit vectors cancels.
-    const vec3 e = {b.x - a.x, b.y - a.y, b.z - a.z}, f = {c.x - a.x, c.y - a.y, c.z - a.z};
+    const xyz e = {b.x - a.x, b.y - a.y, b.z - a.z}, f = {c.x - a.x, c.y - a.y, c.z - a.z};
     const scalar triple = a.x * (e.y * f.z - e.z * f.y) + a.y * (e.z * f.x - e.x * f.z) + a.z * (e.x * f.y - e.y * f.x);
-    area += 2 * atan2(triple, 1 + dot3(a, b) + dot3(b, c) + dot3(c, a));
+    area += 2 * atan2(triple, 1 + dot_xyz(a, b) + dot_xyz(b, c) + dot_xyz(c, a));
     b = c;
   }
   return area;
 }
 
-static inline int clip_box(vec3 *p, int count, scalar s0, scalar s1, scalar t0, scalar t1) {
-  const vec3 planes[4] = {{1, 0, -s0}, {-1, 0, s1}, {0, 1, -t0}, {0, -1, t1}};
+static inline int clip_box(xyz *p, int count, scalar s0, scalar s1, scalar t0, scalar t1) {
+  const xyz planes[4] = {{1, 0, -s0}, {-1, 0, s1}, {0, 1, -t0}, {0, -1, t1}};
   for (int k = 0; k < 4 && count >= 3; k++) count = clip(p, count, planes[k]);
   return count;
 }
@@ -190,7 +190,7 @@ __kernel void mean_cube(__global float *restrict level, const int first, const i
   const int g = get_global_id(0);
   if (g >= count) return;
   const int index = first + g;
-  vec3 texel[MOST];
+  xyz texel[MOST];
   int corners = 0;
   if (latlong) {
     const int i = index / (2 * height), j = index % (2 * height);
@@ -199,7 +199,7 @@ __kernel void mean_cube(__global float *restrict level, const int first, const i
         const scalar along = side ? k / (scalar)chords : 1 - k / (scalar)chords;
         const scalar theta = (i + side) * PI / height, phi = (j + along) * PI / height - PI;
         if ((i + side == 0 || i + side == height) && k > 0) continue;  // a pole is one corner
-        const vec3 d = {sin(theta) * cos(phi), cos(theta), sin(theta) * sin(phi)};
+        const xyz d = {sin(theta) * cos(phi), cos(theta), sin(theta) * sin(phi)};
         texel[corners++] = turn_y(d, turn_c, -turn_s);
       }
   } else {
@@ -211,9 +211,9 @@ __kernel void mean_cube(__global float *restrict level, const int first, const i
   }
   scalar sum[3] = {0, 0, 0}, weight = 0;
   for (int face = 0; face < 6; face++) {
-    vec3 on_face[MOST];
+    xyz on_face[MOST];
     for (int k = 0; k < corners; k++) on_face[k] = to_face(face, texel[k]);
-    const vec3 ahead = {0, 0, 1};
+    const xyz ahead = {0, 0, 1};
     int n = clip_box(on_face, clip(on_face, corners, ahead), -1, 1, -1, 1);
     if (n < 3) continue;
     scalar s0 = 1, s1 = -1, t0 = 1, t1 = -1;
@@ -226,7 +226,7 @@ __kernel void mean_cube(__global float *restrict level, const int first, const i
     const int i0 = max((int)floor((t0 + 1) / 2 * size), 0), i1 = min((int)ceil((t1 + 1) / 2 * size), size);
     for (int i = i0; i < i1; i++)
       for (int j = j0; j < j1; j++) {
-        vec3 cell[MOST];
+        xyz cell[MOST];
         for (int k = 0; k < n; k++) cell[k] = on_face[k];
         const int m = clip_box(cell, n, 2 * j / (scalar)size - 1, 2 * (j + 1) / (scalar)size - 1,
                                2 * i / (scalar)size - 1, 2 * (i + 1) / (scalar)size - 1);

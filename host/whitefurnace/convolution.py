@@ -3,9 +3,8 @@ integral, and refines what misses its tolerance."""
 from __future__ import annotations
 
 import hashlib
-import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 from whitefurnace import plan as planning
 from whitefurnace import source
 from whitefurnace.catalogue import Model
-from whitefurnace.catalogue.rule import gauss
+from whitefurnace.derived import lobe_norm, numbers_of
 from whitefurnace.device import Buffer, Device, Kernel, Program
 from whitefurnace.environments import Environment, cube_solid_angles, latlong_solid_angles
 from whitefurnace.recipe import Chosen
@@ -60,17 +59,6 @@ class Level:
     grid: int
     pairs: int
     seconds: float
-
-
-def lobe_norm(ndf: Model, parameters: dict[str, float]) -> float:
-    """∫ K dω of the prefilter's lobe, in float64 by Gauss panels in log s from the entry's reference."""
-    edges = np.concatenate([[0.0], np.geomspace(1e-14, 1.0, 57)])
-    x, w = gauss(12)
-    total = 0.0
-    for a, b in itertools.pairwise(edges):
-        s = a + (b - a) * x
-        total += float((w * (b - a) * ndf.reference["D"](np.sqrt(1 - s / 2), **parameters) * (1 - s)).sum())
-    return 2 * math.pi * total
 
 
 class Convolver:
@@ -508,11 +496,12 @@ class Lobe:
     alpha: float
 
 
-def ndf_lobe(choice: Chosen, roughness: float, parameters: dict[str, float]) -> Lobe:
-    """The prefilter's lobe of an NDF."""
+def ndf_lobe(device: Device, choice: Chosen, roughness: float, parameters: Mapping[str, Any]) -> Lobe:
+    """The prefilter's lobe of an NDF; raises InputError for a user's that cannot be normalized."""
     entry = choice.model
-    return Lobe(f"r = {roughness:.3f}", entry, tuple(parameters[p.name] for p in entry.parameters),
-                 lobe_norm(entry, parameters), max(roughness * roughness, 1e-5))
+    numbers = numbers_of(device, entry, np.array([[parameters[p.name]] for p in entry.parameters]).reshape(-1, 1))
+    return Lobe(f"r = {roughness:.3f}", entry, tuple(numbers[:, 0].tolist()), lobe_norm(device, entry, parameters),
+                max(roughness * roughness, 1e-5))
 
 
 COSINE = Lobe("irradiance", None, (), math.pi, 1.0)

@@ -66,8 +66,8 @@ class Certified(Integrated):
     """An array with its statement: an `Integrated` whose `error` is the p99 of texel errors at 95 % confidence (for
     spherical harmonics the largest coefficient error over the largest of L00), with `worst` and `rmse`."""
 
-    worst: float
-    rmse: float
+    worst: float = 0.0
+    rmse: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,8 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) ->
     """The jobs of a specular chain, as cubes, or as lat-longs of twice a face's height."""
     jobs = []
     for level in planning.plan_chain(recipe, convolver.texel, convolver.share):
-        lobe = None if level.roughness == 0 else ndf_lobe(recipe.ndf, level.roughness, level.parameters)
+        lobe = (None if level.roughness == 0 else
+                ndf_lobe(convolver.device, recipe.ndf, level.roughness, level.parameters))
         jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size)))
     return jobs
 
@@ -290,8 +291,8 @@ def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | N
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     convolver = Convolver(_device(device), env, precision=planning.precision_for(bound))
     level = run_jobs(convolver, [irradiance_job(convolver, size, bound)], bound)[0]
-    return Certified(level.texels, level.error, level.pairs, time.perf_counter() - begin, level.method, level.worst,
-                     level.rmse)
+    return Certified(level.texels, level.error, level.pairs, time.perf_counter() - begin, level.method,
+                     worst=level.worst, rmse=level.rmse)
 
 
 def harmonics(source: Any, *, rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse",

@@ -1,12 +1,14 @@
 """A validated choice: which models, which integral or chain, which accuracy. No OpenCL and no files."""
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from whitefurnace.catalogue import Model, model
+from whitefurnace.catalogue.user import user_model
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
 
 QUALITIES = {"draft": 1e-2, "normal": 1e-3, "reference": 2e-5}
@@ -21,34 +23,50 @@ class Chosen:
     """A model and the parameters given with it (the rest follow from roughness or have defaults)."""
 
     model: Model
-    given: Mapping[str, float]
+    given: Mapping[str, float | tuple[float, ...]]
 
     def canonical(self) -> dict[str, Any]:
-        return {"name": self.model.name, **{k: float(v) for k, v in sorted(self.given.items())}}
+        text = self.model.text
+        source = {} if text is None else {"sha256": hashlib.sha256(text.encode()).hexdigest()}
+        return {"name": self.model.name, **source, **dict(sorted(self.given.items()))}
 
 
 def chosen(slot: str, spec: str | Model) -> Chosen:
-    """A model from `NAME` or `NAME:p=v,…` or a catalogue entry. Raises UsageError with the nearest name."""
+    """A model from `NAME`, `NAME:PRESET`, `NAME:p=v,…`, `FILE.clh[:p=v,…]` or a catalogue entry.
+
+    A value is a number, or three for RGB (`f0=1/.71/.29`). Raises UsageError with the nearest name, and what
+    `user_model` raises of a file.
+    """
     if isinstance(spec, Model):
         return Chosen(spec, {})
-    name, _, rest = spec.partition(":")
-    if name.endswith(".clh"):
-        raise UnsupportedError(f"{slot} {name!r}: models from a file are not supported by this version")
-    entry = model(slot, name)
+    file, suffix, rest = spec.partition(".clh")
+    if suffix and (not rest or rest[0] == ":"):
+        entry, rest = user_model(slot, file + suffix), rest[1:]
+    else:
+        name, _, rest = spec.partition(":")
+        entry = model(slot, name)
+    where = f"{slot} {entry.name}"
     known = {p.name: p for p in entry.parameters}
-    given: dict[str, float] = {}
+    given: dict[str, float | tuple[float, ...]] = {}
     for item in filter(None, rest.split(",")):
         key, equals, value = item.partition("=")
+        if not equals and entry.presets and key not in known:
+            if key not in entry.presets:
+                raise UsageError(f"{where} has no preset {key!r}{nearest(key, entry.presets)}")
+            given |= entry.presets[key]
+            continue
         if key not in known:
-            raise UsageError(f"{slot} {name} has no parameter {key!r}{nearest(key, known)}")
+            raise UsageError(f"{where} has no parameter {key!r}{nearest(key, known)}")
         try:
-            number = float(value)
+            numbers = tuple(float(part) for part in value.split("/"))
         except ValueError:
-            raise UsageError(f"{slot} {name}: {key}={value!r} is not a number") from None
+            raise UsageError(f"{where}: {key}={value!r} is not a number") from None
         if not equals or key in given:
-            raise UsageError(f"{slot} {name}: {key} must be given once, as {key}=VALUE")
-        known[key].check(number, f"{slot} {name}")
-        given[key] = number
+            raise UsageError(f"{where}: {key} must be given once, as {key}=VALUE")
+        if len(numbers) not in (1, 3):
+            raise UsageError(f"{where}: {key}={value!r} is neither one number nor three (R/G/B)")
+        known[key].check(numbers, where)
+        given[key] = numbers[0] if len(numbers) == 1 else numbers
     return Chosen(entry, given)
 
 
@@ -98,7 +116,9 @@ class Chain:
     def parameters(self, roughness: float) -> dict[str, float]:
         """The NDF's parameters at a perceptual roughness."""
         assert self.ndf.model.from_roughness is not None
-        return {**self.ndf.model.from_roughness(roughness), **self.ndf.given}
+        given = {name: value for name, value in self.ndf.given.items() if not isinstance(value, tuple)}
+        defaults = {p.name: p.default for p in self.ndf.model.parameters if p.default is not None}
+        return {**defaults, **self.ndf.model.from_roughness(roughness), **given}
 
     def canonical(self) -> dict[str, Any]:
         return {"ndf": self.ndf.canonical(), "size": self.size, "min_size": self.min_size,
@@ -121,6 +141,8 @@ def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int = 16, tole
     for name in choice.given:
         if name in follows:
             raise UsageError(f"ndf {choice.model.name}: {name} follows the roughness of each level and cannot be given")
+    if any(isinstance(value, tuple) for value in choice.given.values()):
+        raise UsageError(f"ndf {choice.model.name}: a chain takes one number a parameter, not three")
     missing = [p.name for p in choice.model.parameters
                if p.name not in follows and p.name not in choice.given and p.default is None]
     if missing:

@@ -9,15 +9,30 @@ from importlib import resources
 
 from whitefurnace.catalogue import Integral, Model
 
-# Kernel functions by the macro that binds them: the name's ending and the number of its own arguments.
+# Kernel functions by the macro that binds them: the name's ending and its own arguments, s a number, v a vector,
+# d a direction (a cosine for isotropic NDFs, a vector for anisotropic ones).
 FUNCTIONS = {
-    "NDF_D": ("D", 2),
-    "NDF_LAMBDA": ("lambda", 1),
-    "NDF_WIDTH": ("width", 0),
-    "MASKING_G1": ("G1", 1),
-    "MASKING_G": ("G", 2),
-    "FRESNEL_F": ("F", 1),
+    "NDF_D": ("D", "ss"),
+    "NDF_AREA": ("area", "d"),
+    "NDF_WIDTH": ("width", ""),
+    "NDF_REACH": ("reach", ""),
+    "NDF_STRETCH_X": ("stretch_x", ""),
+    "NDF_STRETCH_Y": ("stretch_y", ""),
+    "NDF_SAMPLE": ("sample", "s"),
+    "MASKING_AT": ("at", "d"),
+    "MASKING_V": ("V", "ssssss"),
+    "MASKING_G": ("G", "ssssss"),
+    "MASKING_G1": ("G1", "ss"),
+    "FRESNEL_F": ("F", "s"),
+    "DIFFUSE_F": ("f", "vv"),
+    "BRDF_F": ("f", "vv"),
 }
+
+LOBE_WIDTH = 0.05
+"""Where the rule of a user's BRDF grades its half vectors, radians: lobes ten times narrower are still met."""
+
+LEAST_COSINE = 1e-9
+"""The least cosine a BRDF given as f(l, v) is asked at, for those that divide by it: the limit for all purposes."""
 
 
 @dataclass(frozen=True)
@@ -38,66 +53,161 @@ def _assemble(parts: Sequence[str | tuple[str, str]]) -> Source:
     lines = []
     for part in parts:
         name, text = part if isinstance(part, tuple) else (part, _file(part))
-        lines.append(f'#line 1 "{name}"\n{text.rstrip()}\n')
+        quoted = name.replace("\\", "/").replace('"', "'")
+        lines.append(f'#line 1 "{quoted}"\n{text.rstrip()}\n')
     whole = "".join(lines)
     return Source(whole, hashlib.sha256(whole.encode()).hexdigest())
 
 
-def _bindings(slots: Mapping[str, Model]) -> str:
+def arguments(function: str, isotropic: bool = True) -> str:
+    """The own arguments of a kernel function, s for a number and v for a vector."""
+    if function == "NDF_D" and not isotropic:
+        return "v"
+    return FUNCTIONS[function][1].replace("d", "s" if isotropic else "v")
+
+
+def _model_text(entry: Model) -> str | tuple[str, str]:
+    return entry.kernel_file if entry.text is None else (entry.path or entry.name, entry.text)
+
+
+def _bindings(slots: Mapping[str, Model], *, cells: Sequence[str] = ("NoV",), area_terms: int = 0) -> str:
     """The #defines that bind each slot to its model: parameter lists, values and functions.
 
     Lists begin with a comma, so that a model without parameters leaves nothing behind. A slot whose model
-    needs another slot's function carries that slot's parameters too.
+    needs another slot's function carries that slot's parameters too. `cells` names the rows of a cell before the
+    models' numbers; `area_terms` is the length of the tabulated Smith area, 0 for none.
     """
-    lines = []
-    own = {slot: [f"{slot}_{p.name}" for p in entry.parameters] for slot, entry in slots.items()}
+    isotropic = "ndf" not in slots or slots["ndf"].isotropic
+    lines = [f"#define DIRECTION {'real' if isotropic else 'real3'}",
+             f"#define COS_OF(d) {'(d)' if isotropic else '((d).z)'}"]
+    if not isotropic:
+        lines.append("#define ANISOTROPIC")
+    area = [f"ndf_area_{name}" for name in ("scale", "per_range", "grazing")]
+    table = [*(("real", name) for name in area), ("const real *", "ndf_area_terms")] if area_terms else []
+    if area_terms:
+        lines.append(f"#define AREA_TERMS {area_terms}")
+    own = {slot: [("real", f"{slot}_{name}") for name in entry.arguments] for slot, entry in slots.items()}
+    bound: set[str] = set()
     for slot, entry in slots.items():
         needed = {name.split("_")[0].lower() for name in entry.needs} - {slot}
-        names = [n for other in sorted(needed) for n in own[other]] + own[slot]
+        listed = [n for other in sorted(needed) for n in own[other]] + own[slot]
+        if slot == "ndf" or "ndf" in needed:
+            listed += table
         upper = slot.upper()
-        for kind, prefix in (("PARAMETERS", "real "), ("VALUES", ""), ("SCALARS", "const scalar ")):
-            lines.append(f"#define {upper}_{kind} " + "".join(f", {prefix}{n}" for n in names))
-        carries = f" {upper}_VALUES" if needed or entry.slot in ("masking", "fresnel") else None
+        for kind, form in (("PARAMETERS", ", {0} {1}"), ("VALUES", ", {1}"), ("SCALARS", ", const scalar {1}")):
+            kept = [n for n in listed if kind != "SCALARS" or n not in table]
+            lines.append(f"#define {upper}_{kind} " + "".join(form.format(*n) for n in kept))
         for function in entry.provides:
-            ending, count = FUNCTIONS[function]
-            dummies = [f"a{k}" for k in range(count)]
-            target = f"{slot}_{entry.name}_{ending}"
-            if carries is None:  # a self-contained model names its parameters in its own signature
-                values = ", ".join(dummies + names)
-                bound = function
-                if function == "NDF_D":  # D is 0 for backfacing m, whatever the model: said here, once for all
-                    bound = "NDF_D_FRONT"
-                    lines.append("#define NDF_D(a0, a1) ((a0) > 0 ? NDF_D_FRONT(a0, a1) : (real)0)")
-                lines.append(f"#define {bound}{'(' + ', '.join(dummies) + ')' if count else ''} {target}({values})")
+            ending = FUNCTIONS[function][0]
+            dummies = [f"a{k}" for k in range(len(arguments(function, isotropic)))]
+            passed = dummies[:1] if function == "NDF_D" and not entry.takes_sin2 else dummies
+            target, name = f"{slot}_{entry.name}_{ending}", function
+            head = f"({', '.join(dummies)})" if dummies else ""
+            if slot in ("ndf", "diffuse", "brdf"):  # self-contained: its signature names its own numbers
+                call = f"{target}({', '.join([*passed, *(f'{slot}_{n}' for n in entry.passed(function))])})"
+                if function == "NDF_D":
+                    # D is 0 for backfacing m, whatever the model, and a user's is divided by its norm: said once.
+                    name, scaled = "NDF_D_FRONT", "" if entry.text is None else "ndf_per_norm * "
+                    lines.append("#define NDF_D(a0) ((a0).z > 0 ? NDF_D_FRONT(a0) : (real)0)" if not isotropic else
+                                 "#define NDF_D(a0, a1) ((a0) > 0 ? NDF_D_FRONT(a0, a1) : (real)0)")
+                    call = f"({scaled}{call})"
             else:
-                lines.append(f"#define {function}({', '.join(dummies)}) {target}({', '.join(dummies)}{carries})")
-    names = [n for slot in slots for n in own[slot]]
-    lines.append("#define CELL_PARAMETERS " + "".join(f", real {n}" for n in names))
-    lines.append("#define CELL_VALUES " + "".join(f", {n}" for n in names))
+                call = f"{target}({', '.join(passed)} {upper}_VALUES)"
+            lines.append(f"#define {name}{head} {call}")
+            bound.add(function)
+    if area_terms:
+        lines.append("#define NDF_AREA(d) area_of_table(d, " + ", ".join(area) + ", ndf_area_terms)")
+    if "ndf" in slots:
+        if slots["ndf"].text is not None:
+            lines.append("#define NDF_WIDTH ndf_width")
+        if "NDF_REACH" not in bound:
+            lines.append("#define NDF_REACH ((real)HALF_PI)")
+    if "masking" not in slots:
+        lines.append("#define MASKING_AT(d) ((real)0)")
+    rows = [*(f"cell_{name}" for name in cells), *(n for slot in slots for _, n in own[slot])]
+    names = [n for slot in slots for n in own[slot]] + table
+    lines.append("#define CELL_PARAMETERS " + "".join(f", {kind} {n}" for kind, n in names))
+    lines.append("#define CELL_VALUES " + "".join(f", {n}" for _, n in names))
     lines.append("#define CELL_ARRAYS , __global const scalar *restrict cell_values")
-    loads = ["real cell_NoV = LOAD(g, cell_values);"]
-    loads += [f"real {n} = LOAD(g, cell_values + (size_t){k + 1} * cells);" for k, n in enumerate(names)]
+    loads = [f"const real {n} = LOAD(g, cell_values + (size_t){k} * cells);" for k, n in enumerate(rows)]
+    if area_terms:
+        first = len(rows)
+        for k, name in enumerate(area):
+            loads.append(f"const real {name} = LOAD(g, cell_values + (size_t){first + k} * cells);")
+        loads.append(f"real ndf_area_terms[AREA_TERMS]; for (int k = 0; k < AREA_TERMS; k++) "
+                     f"ndf_area_terms[k] = LOAD(g, cell_values + (size_t)({first + len(area)} + k) * cells);")
     lines.append("#define CELL_LOAD " + " ".join(loads))
     return "\n".join(lines) + "\n"
 
 
 def cell_parameters(slots: Mapping[str, Model]) -> list[tuple[str, str]]:
-    """(slot, parameter) in the order in which `integrate` reads them, after n·v."""
-    return [(slot, p.name) for slot, entry in slots.items() for p in entry.parameters]
+    """(slot, number) in the order in which kernels read them: parameters and constants of each slot."""
+    return [(slot, name) for slot, entry in slots.items() for name in entry.arguments]
 
 
-def integration(integral: Integral, slots: Mapping[str, Model]) -> Source:
+def _models(slots: Mapping[str, Model], area_terms: int) -> list[str | tuple[str, str]]:
+    """The texts of the models, and of the table where Smith's area comes from one."""
+    return ["special.clh", *(["area_table.clh"] if area_terms else []), *(_model_text(m) for m in slots.values())]
+
+
+def integration(integral: Integral, slots: Mapping[str, Model], area_terms: int = 0) -> Source:
     """The program of one integral over the models of `slots` (in the order ndf, masking, fresnel)."""
-    support = "#define HALF_ANGLE\n" if integral.half_angle else ""
-    return _assemble(["real.clh", ("bindings", support + _bindings(slots)), *(m.kernel_file for m in slots.values()),
-                      "ring.clh", f"integrand/{integral.name}.clh", "integrate.cl"])
+    isotropic = slots["ndf"].isotropic
+    cells = ("NoV",) if isotropic else ("NoV", "phi")
+    support = f"#define {integral.support}\n"
+    return _assemble(["real.clh", ("bindings", support + _bindings(slots, cells=cells, area_terms=area_terms)),
+                      *_models(slots, area_terms), "facet.clh", *(["ring.clh"] if isotropic else []),
+                      f"integrand/{integral.name}.clh", "integrate.cl" if isotropic else "stretched.cl"])
+
+
+def area(ndf: Model) -> Source:
+    """The program that makes the table of Smith's area."""
+    return _assemble(["real.clh", ("bindings", "#define POLAR\n" + _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0),
+                      "ring.clh", "area.cl"])
+
+
+def hemisphere(entry: Model) -> Source:
+    """The program of the directional albedo of a BRDF f(l, v): a diffuse model, or a user's whole one."""
+    smooth = entry.slot == "diffuse"
+    result = ("sum[0] += w * DIFFUSE_F(l, v);" if smooth else
+              "const real3 f = BRDF_F(l, v); sum[0] += w * f.x; sum[1] += w * f.y; sum[2] += w * f.z;")
+    defines = (f"{'#define SMOOTH' if smooth else '#define HALF_ANGLE'}\n#define AZIMUTH_PANELS {2 if smooth else 4}\n"
+               f"#define COMPONENTS {1 if smooth else 3}\n#define LOBE_WIDTH ((scalar){LOBE_WIDTH!r})\n"
+               f"#define LEAST_COSINE ((scalar){LEAST_COSINE!r})\n")
+    scatter = f"static inline void scatter(real *sum, real w, real3 l, real3 v CELL_PARAMETERS) {{ {result} }}\n"
+    slots = {entry.slot: entry}
+    cells = ("NoV",) if smooth else ("NoV", "phi")
+    return _assemble(["real.clh", ("bindings", defines + _bindings(slots, cells=cells)),
+                      *_models(slots, 0), *([] if smooth else ["ring.clh"]), ("scatter", scatter), "hemisphere.cl"])
+
+
+def evaluation(function: str, slots: Mapping[str, Model], area_terms: int = 0) -> Source:
+    """The program that evaluates `function` (`NDF_D`, `MASKING_V`, …) of `slots` at given arguments: `evaluate.cl`.
+
+    A cell holds the function's own arguments, three rows for a vector, then the models' numbers.
+    """
+    isotropic = "ndf" not in slots or slots["ndf"].isotropic
+    rows, values = [], []
+    for k, kind in enumerate(arguments(function, isotropic)):
+        names = [f"{k}{axis}" for axis in ("xyz" if kind == "v" else ("",))]
+        rows += names
+        values.append(f"vec3({', '.join(f'cell_{n}' for n in names)})" if kind == "v" else f"cell_{names[0]}")
+    call = f"{function}({', '.join(values)})" if values else function
+    if function == "BRDF_F":
+        result = (f"const real3 f = {call}; STORE(f.x, g, out); STORE(f.y, g, out + (size_t)cells); "
+                  "STORE(f.z, g, out + 2 * (size_t)cells);")
+    else:
+        result = f"STORE({call}, g, out);"
+    return _assemble(["real.clh", ("bindings", _bindings(slots, cells=rows, area_terms=area_terms)),
+                      *_models(slots, area_terms), ("evaluate", f"#define EVALUATE {result}\n"), "evaluate.cl"])
 
 
 def convolution(ndf: Model | None) -> Source:
     """The zonal convolution with the lobe of an NDF, or with the cosine lobe of irradiance for None."""
     if ndf is None:
         return _assemble(["real.clh", "lobe_cosine.clh", "prefilter.cl"])
-    return _assemble(["real.clh", ("bindings", _bindings({"ndf": ndf})), ndf.kernel_file, "lobe.clh", "prefilter.cl"])
+    return _assemble(["real.clh", ("bindings", _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0), "lobe.clh",
+                      "prefilter.cl"])
 
 
 def texels(kind: str) -> Source:

@@ -1,13 +1,31 @@
 """The papers that entries and kernels cite, by key."""
 
 PAPERS = {
+    "Bagher2012": "M. Bagher, C. Soler, N. Holzschuch, Accurate Fitting of Measured Reflectances Using a Shifted Gamma "
+                  "Micro-facet Distribution, CGF 31(4), 2012",
+    "BornWolf1999": "M. Born, E. Wolf, Principles of Optics, 7th edition, Cambridge University Press, 1999",
+    "Burley2012": "B. Burley, Physically Based Shading at Disney, SIGGRAPH 2012 course",
+    "CookTorrance1982": "R. Cook, K. Torrance, A Reflectance Model for Computer Graphics, ACM TOG 1(1), 1982",
+    "Estevez2017": "A. C. Estevez, C. Kulla, Production Friendly Microfacet Sheen BRDF, SIGGRAPH 2017 course",
+    "Fujii2012": "Y. Fujii, A Tiny Improvement of Oren-Nayar Reflectance Model, 2012",
     "Heitz2014": "E. Heitz, Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs, JCGT 3(2), 2014",
     "Hoffman2012": "N. Hoffman, Background: Physics and Math of Shading, SIGGRAPH 2012 course",
     "Karis2013": "B. Karis, Real Shading in Unreal Engine 4, SIGGRAPH 2013 course",
+    "Kelemen2001": "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with Importance "
+                   "Sampling, Eurographics short presentations, 2001",
+    "Kutz2021": "P. Kutz, M. Hašan, E. Edmondson, Novel Aspects of the Adobe Standard Material, Adobe, 2021",
     "Lagarde2014": "S. Lagarde, C. de Rousiers, Moving Frostbite to Physically Based Rendering, SIGGRAPH 2014 course",
+    "Low2012": "J. Löw et al., BRDF Models for Accurate and Efficient Rendering of Glossy Surfaces, ACM TOG 31(1), "
+               "2012",
+    "Minnaert1941": "M. Minnaert, The Reciprocity Principle in Lunar Photometry, Astrophysical Journal 93, 1941",
+    "Neumann1999": "L. Neumann, A. Neumann, L. Szirmay-Kalos, Compact Metallic Reflectance Models, CGF 18(3), 1999",
+    "OrenNayar1994": "M. Oren, S. Nayar, Generalization of Lambert's Reflectance Model, SIGGRAPH 1994",
+    "Portsmouth2025": "J. Portsmouth, P. Kutz, S. Hill, EON: A Practical Energy-Preserving Rough Diffuse BRDF, "
+                      "JCGT 14(1), 2025",
     "Ramamoorthi2001": "R. Ramamoorthi, P. Hanrahan, An Efficient Representation for Irradiance Environment Maps, "
                        "SIGGRAPH 2001",
     "Schlick1994": "C. Schlick, An Inexpensive BRDF Model for Physically-Based Rendering, CGF 13(3), 1994",
+    "Shirley1997": "P. Shirley et al., A Practitioners' Assessment of Light Reflection Models, Pacific Graphics 1997",
     "VanOosterom1983": "A. Van Oosterom, J. Strackee, The Solid Angle of a Plane Triangle, IEEE TBME 30(2), 1983",
     "Walter2007": "B. Walter et al., Microfacet Models for Refraction through Rough Surfaces, EGSR 2007",
 }

@@ -38,7 +38,13 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Model:
-    """One model of a slot. `provides` and `needs` name kernel functions as SLOT_FUNCTION (`NDF_D`)."""
+    """One model of a slot. `provides` and `needs` name kernel functions as SLOT_FUNCTION (`NDF_D`).
+
+    `constants` gives float64 numbers that follow from the parameters alone, such as a norm; kernel functions take
+    them, in the order of `constant_names`, after the parameters. `presets` are named parameter sets, RGB as three.
+    `text` is the kernel text of a model from a user's file, `path` where it lies and `takes_sin2` whether its D wants
+    sin²θ; a model of ours has a kernel file.
+    """
 
     slot: str
     name: str
@@ -52,20 +58,37 @@ class Model:
     isotropic: bool = True
     from_roughness: Callable[[float], dict[str, float]] | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
+    constants: Callable[..., dict[str, np.ndarray]] | None = None
+    constant_names: tuple[str, ...] = ()
+    presets: Mapping[str, Mapping[str, float | tuple[float, float, float]]] = field(default_factory=dict)
+    text: str | None = None
+    path: str | None = None
+    takes_sin2: bool = True
 
     @property
     def kernel_file(self) -> str:
         return f"{self.slot}/{self.name}.clh"
 
+    @property
+    def arguments(self) -> tuple[str, ...]:
+        """Names of the numbers a kernel function takes after its own: parameters, then constants."""
+        return (*(p.name for p in self.parameters), *self.constant_names)
+
+    def passed(self, function: str) -> tuple[str, ...]:
+        """Those of `arguments` that a kernel function of a self-contained model takes: constants go to D and its
+        sampler alone, and a user's file knows none."""
+        wanted = self.text is None and function in ("NDF_D", "NDF_SAMPLE", "DIFFUSE_F")
+        return self.arguments if wanted else tuple(p.name for p in self.parameters)
+
 
 @dataclass(frozen=True)
 class Integral:
-    """An integral of the catalogue: `integrand/NAME.clh` under the rule that fits its support."""
+    """An integral of the catalogue: `integrand/NAME.clh` under the rule that fits its `support` (`ring.clh`)."""
 
     name: str
     title: str
     components: int
     needs: tuple[str, ...]
-    half_angle: bool
+    support: str
     view: bool
     about: str

@@ -8,7 +8,7 @@ from functools import cache
 from whitefurnace.catalogue.model import Integral, Model
 from whitefurnace.errors import UsageError, nearest
 
-SLOTS = ("ndf", "masking", "fresnel")
+SLOTS = ("ndf", "masking", "fresnel", "diffuse", "light")
 
 
 @cache
@@ -35,18 +35,23 @@ def model(slot: str, name: str) -> Model:
 INTEGRALS = {
     entry.name: entry
     for entry in (
-        Integral("normalization", "NDF normalization", 1, ("NDF_D",), False, False,
-                 "∫ D(m)(n·m) dω over the hemisphere; 1 for a normalized NDF"),
-        Integral("projected_area", "Projected area", 1, ("NDF_D",), False, True,
+        Integral("normalization", "NDF normalization", 1, ("NDF_D",), "ALL", False,
+                 "∫ D(m)(n·m) dω over the hemisphere; 1 for a normalized NDF, the raw norm of a user's"),
+        Integral("projected_area", "Projected area", 1, ("NDF_D",), "POLAR", True,
                  "A(v) = ∫ D(m)(v·m)₊ dω"),
-        Integral("weak_furnace", "Weak white furnace", 1, ("NDF_D", "MASKING_G1"), False, True,
+        Integral("weak_furnace", "Weak white furnace", 1, ("NDF_D", "MASKING_G1"), "POLAR", True,
                  "∫ D(m) G1(v)(v·m)₊ dω / (n·v); 1 where the masking fits the NDF"),
-        Integral("albedo", "Directional albedo", 1, ("NDF_D", "MASKING_G", "FRESNEL_F"), True, True,
+        Integral("albedo", "Directional albedo", 1, ("NDF_D", "MASKING_V", "FRESNEL_F"), "HALF_ANGLE", True,
                  "E(v) = ∫ f(l, v)(n·l) dω"),
-        Integral("dfg", "Split-sum pair", 2, ("NDF_D", "MASKING_G"), True, True,
+        Integral("albedo_average", "Average albedo", 1, ("NDF_D", "MASKING_V", "FRESNEL_F"), "HALF_ANGLE", False,
+                 "2 ∫ E(μ) μ dμ"),
+        Integral("dfg", "Split-sum pair", 2, ("NDF_D", "MASKING_V"), "HALF_ANGLE", True,
                  "(A, B) with E(v; F0) = F0·A + B, Schlick's F with F90 = 1"),
     )
 }
+
+LOBE = Integral("lobe", "The prefilter's lobe", 1, ("NDF_D",), "LOBE", False,
+                "∫ K dω of K(l·r) = D(h)(n·l) with n = v = r")
 
 
 def integral(name: str) -> Integral:

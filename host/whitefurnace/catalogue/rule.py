@@ -1,4 +1,4 @@
-"""Quadrature rules: Gauss nodes on [0, 1], and the ladder of product rules an integral climbs."""
+"""Quadrature rules: Gauss nodes on [0, 1], and the ladders of product rules that integrals climb."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -16,28 +16,62 @@ def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Rule:
-    """A product rule of `integrate.cl`: nodes in the two θ panels and in φ."""
+    """A product of Gauss rules: nodes in the two polar panels (`near`, `far`; 0 near where there is one) and in each
+    of `panels` azimuth panels."""
 
+    family: str
     near: int
     far: int
     azimuths: int
+    panels: int = 1
 
     @property
     def name(self) -> str:
-        return f"gauss-{self.near}+{self.far}x{self.azimuths}"
+        polar = f"{self.near}+{self.far}" if self.near else f"{self.far}"
+        return f"{self.family}-{polar}x{self.azimuths if self.panels == 1 else f'{self.panels}*{self.azimuths}'}"
 
     @property
     def evaluations(self) -> int:
-        return (self.near + self.far) * self.azimuths
+        return (self.near + self.far) * self.azimuths * self.panels
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """What a kernel is told of the polar nodes: those of panel 0 where it has two, and all."""
+        return (self.near, self.near + self.far) if self.near else (self.far,)
 
     def tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """θ nodes of both panels (near + far, 2) and φ nodes (azimuths, 2), as (x, w) pairs in float64."""
-        pairs = [np.stack(gauss(n), 1) for n in (self.near, self.far, self.azimuths)]
-        return np.concatenate(pairs[:2]), pairs[2]
+        """Polar nodes (near + far, 2) and azimuth nodes (azimuths, 2), as (x, w) pairs in float64."""
+        pairs = [np.stack(gauss(n), 1) for n in (self.near, self.far, self.azimuths) if n]
+        return np.concatenate(pairs[:-1]), pairs[-1]
+
+
+def _ladder(family: str, panels: int, *steps: tuple[int, int, int]) -> tuple[Rule, ...]:
+    return tuple(Rule(family, *step, panels) for step in steps)
 
 
 # The errors that height-correlated GGX shows against an independent 1-D form, n·v ≥ 1/256, α ≥ 1e-4, are in
-# tests/test_integrate.py. Neighbours differ in every factor: the error
-# of one that two rules share would not show in their difference. Each step costs about 1.5 times the one before.
-LADDER = (Rule(10, 16, 8), Rule(12, 24, 10), Rule(16, 32, 12), Rule(20, 36, 16), Rule(24, 40, 16), Rule(32, 48, 24),
-          Rule(40, 64, 24), Rule(56, 88, 32), Rule(80, 120, 48), Rule(112, 168, 64))
+# tests/test_integrate.py. Neighbours differ in every factor: the error of one that two rules share would not show in
+# their difference. Each step costs about 1.5 times the one before.
+LADDERS = {
+    # ring.clh: an NDF of the polar angle
+    "gauss": _ladder("gauss", 1, (10, 16, 8), (12, 24, 10), (16, 32, 12), (20, 36, 16), (24, 40, 18), (32, 48, 24),
+                     (40, 64, 26), (56, 88, 32), (80, 120, 48), (112, 168, 64), (160, 240, 96)),
+    # ring.clh without an azimuth: normalization
+    "polar": _ladder("polar", 1, (12, 12, 1), (16, 18, 1), (20, 24, 1), (28, 32, 1), (40, 44, 1), (56, 64, 1),
+                     (80, 88, 1), (112, 128, 1), (168, 192, 1), (256, 288, 1)),
+    # stretched.cl: anisotropic NDFs
+    "stretched": _ladder("stretched", 4, (0, 10, 5), (0, 14, 7), (0, 20, 10), (0, 28, 13), (0, 36, 18), (0, 48, 24),
+                         (0, 64, 32), (0, 88, 44), (0, 120, 64), (0, 168, 96)),
+    # hemisphere.cl: diffuse models, and BRDFs of whom nothing is known
+    "hemisphere": _ladder("hemisphere", 2, (8, 8, 6), (10, 12, 8), (14, 16, 10), (20, 24, 14), (28, 32, 18),
+                          (40, 44, 26), (56, 64, 36), (80, 88, 48), (112, 128, 64), (168, 192, 96)),
+    "half-vectors": _ladder("half-vectors", 4, (10, 16, 4), (14, 24, 6), (20, 32, 8), (28, 44, 12), (40, 64, 16),
+                            (56, 88, 24), (80, 120, 32), (112, 168, 48), (160, 240, 64)),
+}
+
+AREA_RULES = {32: (Rule("polar", 80, 120, 1), Rule("polar", 112, 168, 1)),
+              64: (Rule("polar", 160, 240, 1), Rule("polar", 224, 320, 1))}
+"""The rules of Smith's tabulated area by precision: the second makes the table, the first tells its error."""
+
+AVERAGE_RULES = (12, 18, 26, 36, 52, 76)
+"""Nodes in n·v of an average albedo, after μ = x², which resolves the grazing end."""

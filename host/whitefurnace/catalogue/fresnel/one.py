@@ -11,4 +11,5 @@ ENTRY = Model(
     parameters=(),
     provides=("FRESNEL_F",),
     reference={"F": lambda cos_d: np.ones_like(np.asarray(cos_d, np.float64))},
+    facts={"at 0°": "1", "at 90°": "1"},
 )

@@ -9,6 +9,25 @@ def _f(cos_d, f0, f90):
     return f0 * (1 - weight) + f90 * weight
 
 
+# F(0°), linear, of "Real-Time Rendering", 3rd edition, as [Hoffman2012] has it.
+_METALS = {
+    "gold": (1.00, 0.71, 0.29),
+    "silver": (0.95, 0.93, 0.88),
+    "copper": (0.95, 0.64, 0.54),
+    "iron": (0.56, 0.57, 0.58),
+    "aluminum": (0.91, 0.92, 0.92),
+}
+_INSULATORS = {
+    "water": 0.02,
+    "plastic": 0.03,  # "Plastic / Glass (Low)", under each of its names
+    "plastic_low": 0.03,
+    "glass_low": 0.03,
+    "plastic_high": 0.05,
+    "glass_high": 0.08,  # "Glass (High) / Ruby"
+    "ruby": 0.08,
+    "diamond": 0.17,
+}
+
 ENTRY = Model(
     slot="fresnel",
     name="schlick",
@@ -20,4 +39,7 @@ ENTRY = Model(
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
+    facts={"at 0°": "f0", "at 90°": "f90", "presets": "F(0°), linear, from the tables of [Hoffman2012]"},
+    presets={name: {"f0": f0} for name, f0 in _METALS.items()} |
+            {name: {"f0": (f0, f0, f0)} for name, f0 in _INSULATORS.items()},
 )

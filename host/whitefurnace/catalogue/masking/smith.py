@@ -1,5 +1,30 @@
-"""Smith's masking-shadowing, height-correlated, for any NDF that has Λ."""
+"""Smith's masking-shadowing, height-correlated, for any NDF."""
+import numpy as np
+
 from whitefurnace.catalogue.model import Model
+
+
+def _g1(NoV, at_v):
+    """By Λ = A/(n·v) - 1, infinite at n·v = 0. [Heitz2014, eq. 43]"""
+    with np.errstate(divide="ignore"):
+        return 1 / (1 + (np.asarray(at_v, np.float64) / NoV - 1))
+
+
+def _g(NoV, NoL, NoH, VoH, at_v, at_l):
+    """By Λ. [Heitz2014, eq. 99]"""
+    NoL = np.asarray(NoL, np.float64)
+    with np.errstate(divide="ignore"):
+        lambda_v, lambda_l = np.asarray(at_v, np.float64) / NoV - 1, np.asarray(at_l) / np.where(NoL > 0, NoL, 1.0) - 1
+    return np.where(NoL > 0, 1 / (1 + lambda_v + lambda_l), 0.0)
+
+
+def _v(NoV, NoL, NoH, VoH, at_v, at_l):
+    """The separable V over what correlation adds, G1(v) + G1(l) - G1(v) G1(l)."""
+    NoL = np.asarray(NoL, np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        g1_v, g1_l = NoV / np.asarray(at_v, np.float64), NoL / np.asarray(at_l, np.float64)
+        return np.where(NoL > 0, 1 / (np.asarray(at_v) * at_l * (g1_v + g1_l - g1_v * g1_l)), 0.0)
+
 
 ENTRY = Model(
     slot="masking",
@@ -7,8 +32,8 @@ ENTRY = Model(
     title="Smith, height-correlated",
     citation="Heitz2014",
     parameters=(),
-    provides=("MASKING_G1", "MASKING_G"),
-    needs=("NDF_LAMBDA",),
-    reference={"G1": lambda lv: 1 / (1 + lv), "G": lambda lv, ll: 1 / (1 + lv + ll)},
-    facts={"reciprocal": True, "weak furnace": 1.0},
+    provides=("MASKING_AT", "MASKING_V", "MASKING_G", "MASKING_G1"),
+    needs=("NDF_AREA",),
+    reference={"V": _v, "G": _g, "G1": _g1},
+    facts={"reciprocal": True, "follows roughness": True, "weak furnace": 1.0},
 )

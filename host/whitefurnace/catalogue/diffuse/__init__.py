@@ -1,0 +1,1 @@
+"""Entries of the slot `diffuse`: one module a model, with `ENTRY`."""

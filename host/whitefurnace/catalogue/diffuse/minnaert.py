@@ -1,0 +1,31 @@
+"""Minnaert's law of limb darkening."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model, Parameter
+
+
+def _f(light, view, albedo, exponent):
+    return (albedo * (exponent + 1) / (2 * np.pi) * np.power(light[..., 2], exponent - 1.0) *
+            np.power(view[..., 2], exponent - 1.0))
+
+
+def _albedo(NoV, albedo, exponent):
+    """∫μ^k dμ = 1/(k + 1) leaves albedo (n·v)^(k-1)."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(albedo, np.float64) * np.power(np.asarray(NoV, np.float64), exponent - 1.0)
+
+
+ENTRY = Model(
+    slot="diffuse",
+    name="minnaert",
+    title="Minnaert",
+    citation="Minnaert1941",
+    parameters=(
+        Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0), "directional albedo at normal view"),
+        Parameter("exponent", "k", "1", 0.0, 10.0, (0.0, 0.5, 1.0, 1.5, 3.0),
+                  "1 is Lambert, more darkens the limb, less brightens it"),
+    ),
+    provides=("DIFFUSE_F",),
+    reference={"f": _f, "albedo": _albedo},
+    facts={"reciprocal": True},  # FACTS
+)

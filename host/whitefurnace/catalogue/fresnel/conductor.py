@@ -1,0 +1,35 @@
+"""Fresnel's equations for a metal."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model, Parameter
+
+
+def _f(cos_d, eta, kappa):
+    """In complex numbers: amplitudes with the root p of (η + iκ)² - sin²θ, Im p ≥ 0."""
+    c = np.asarray(cos_d, np.float64)
+    index = np.asarray(eta, np.float64) + 1j * np.asarray(kappa, np.float64)
+    index2, p = index**2, np.sqrt((index - 1) * (index + 1) + c**2)
+    tiny = 1e-300  # c = 0 and index 1: no boundary, no reflection
+    r_s, r_p = (c - p) / (c + p + tiny), (index2 * c - p) / (index2 * c + p + tiny)
+    return (np.abs(r_s) ** 2 + np.abs(r_p) ** 2) / 2
+
+
+ENTRY = Model(
+    slot="fresnel",
+    name="conductor",
+    title="Fresnel, conductor",
+    citation="BornWolf1999",
+    parameters=(
+        Parameter("eta", "η", "1", 1e-3, 20.0, (0.05, 0.2, 1.0, 2.5, 10.0),
+                  "real part of the metal's index over that of this side"),
+        Parameter("kappa", "κ", "1", 0.0, 30.0, (0.0, 1.0, 3.0, 10.0),
+                  "imaginary part of the same: the extinction"),
+    ),
+    provides=("FRESNEL_F",),
+    reference={"F": _f},
+    facts={
+        "at 0°": "((η - 1)² + κ²)/((η + 1)² + κ²)",
+        "at 90°": "1, but 0 for η = 1, κ = 0",
+        # FACTS
+    },
+)

@@ -1,0 +1,35 @@
+"""Fresnel's equations between two insulators."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model, Parameter
+
+
+def _f(cos_d, ior):
+    """Amplitudes by the angles, as Fresnel wrote them, with n cos θt = √(n² - sin²θ) by Snell's law."""
+    c, n = np.broadcast_arrays(np.asarray(cos_d, np.float64), np.asarray(ior, np.float64))
+    square = (n - 1) * (n + 1) + c**2
+    cos_t = np.sqrt(np.maximum(square, 0.0)) / n
+    tiny = 1e-300  # c = 0 and n = 1: no boundary, no reflection
+    r_s = (c - n * cos_t) / (c + n * cos_t + tiny)
+    r_p = (n * c - cos_t) / (n * c + cos_t + tiny)
+    return np.where(square >= 0, (r_s**2 + r_p**2) / 2, 1.0)
+
+
+ENTRY = Model(
+    slot="fresnel",
+    name="dielectric",
+    title="Fresnel, dielectric",
+    citation="Walter2007",
+    parameters=(
+        Parameter("ior", "n", "1", 0.2, 5.0, (0.4, 0.75, 1.0, 1.333, 1.5, 2.417, 5.0),
+                  "index of the far side over that of this side; below 1 there is total internal reflection"),
+    ),
+    provides=("FRESNEL_F",),
+    reference={"F": _f},
+    facts={
+        "at 0°": "((n - 1)/(n + 1))²",
+        "at 90°": "1, but 0 for n = 1",
+        # FACTS
+    },
+    presets={"water": {"ior": 1.333}, "glass": {"ior": 1.5}, "diamond": {"ior": 2.417}},
+)

@@ -1,0 +1,28 @@
+"""Schlick's curve with a second reflectance of the metal, near grazing."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model, Parameter
+
+
+def _f(cos_d, f0, f82):
+    """A straight mix of 1, f0 and f82 by weights: (1 - c)⁵ of 1, the dip's share of f82, the rest of f0."""
+    c = np.asarray(cos_d, np.float64)
+    dip = (c / (1 / 7)) * ((1 - c) / (6 / 7)) ** 6
+    grazing = (1 - c) ** 5 - dip * (6 / 7) ** 5
+    return grazing + dip * f82 + (1 - dip - grazing) * f0
+
+
+ENTRY = Model(
+    slot="fresnel",
+    name="schlick_f82",
+    title="Schlick with F82",
+    citation="Kutz2021",
+    parameters=(
+        Parameter("f0", "F0", "1", 0.0, 1.0, (0.04, 0.56, 0.95, 1.0), "reflectance at normal incidence"),
+        Parameter("f82", "F82", "1", 0.0, 1.0, (0.3, 0.6, 0.9, 1.0),
+                  "reflectance at cos θ = 1/7 (81.8°); itself, not a tint of Schlick's"),
+    ),
+    provides=("FRESNEL_F",),
+    reference={"F": _f},
+    facts={"at 0°": "f0", "at 81.8°": "f82", "at 90°": "1"},
+)

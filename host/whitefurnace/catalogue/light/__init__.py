@@ -1,0 +1,1 @@
+"""Entries of the slot `light`: one module a model, with `ENTRY`."""

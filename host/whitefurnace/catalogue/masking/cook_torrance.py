@@ -1,0 +1,30 @@
+"""Cook and Torrance's geometry factor of V-grooves."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model
+
+
+def _v(NoV, NoL, NoH, VoH, at_v, at_l):
+    """The least of the three terms of G, each divided by (n·l)(n·v) beforehand."""
+    NoV, NoL = np.asarray(NoV, np.float64), np.asarray(NoL, np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        open_ = 2 * np.asarray(NoH) / VoH
+        return np.where(NoL > 0, np.minimum(np.minimum(open_ / NoL, open_ / NoV), 1 / (NoL * NoV)), 0.0)
+
+
+def _g(NoV, NoL, NoH, VoH, at_v, at_l):
+    """With 2(n·h)/(v·h) = (n·l + n·v)/(v·h)², since h is half of l + v, made long as one."""
+    NoV, NoL = np.asarray(NoV, np.float64), np.asarray(NoL, np.float64)
+    return np.where(NoL > 0, np.minimum(1.0, (NoL + NoV) * np.minimum(NoL, NoV) / np.square(VoH)), 0.0)
+
+
+ENTRY = Model(
+    slot="masking",
+    name="cook_torrance",
+    title="Cook-Torrance",
+    citation="CookTorrance1982",
+    parameters=(),
+    provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
+    reference={"V": _v, "G": _g},
+    facts={"reciprocal": True, "follows roughness": False},
+)

@@ -1,0 +1,24 @@
+"""Kelemen and Szirmay-Kalos' visibility, 1/(v·h)²."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model
+
+
+def _v(NoV, NoL, NoH, VoH, at_v, at_l):
+    return np.asarray(VoH, np.float64) ** -2.0
+
+
+def _g(NoV, NoL, NoH, VoH, at_v, at_l):
+    return np.where(np.asarray(NoL) > 0, (np.asarray(NoL) / VoH) * (np.asarray(NoV) / VoH), 0.0)
+
+
+ENTRY = Model(
+    slot="masking",
+    name="kelemen",
+    title="Kelemen-Szirmay-Kalos",
+    citation="Kelemen2001",
+    parameters=(),
+    provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
+    reference={"V": _v, "G": _g},
+    facts={"reciprocal": True, "follows roughness": False},
+)

@@ -1,0 +1,26 @@
+"""Neumann's G = min(n·l, n·v)."""
+import numpy as np
+
+from whitefurnace.catalogue.model import Model
+
+
+def _g(NoV, NoL, NoH, VoH, at_v, at_l):
+    return np.clip(np.minimum(NoL, NoV), 0.0, None)
+
+
+def _v(NoV, NoL, NoH, VoH, at_v, at_l):
+    """min(1/(n·l), 1/(n·v)), infinite where both graze."""
+    with np.errstate(divide="ignore"):
+        return np.where(np.asarray(NoL) > 0, np.minimum(1 / np.abs(NoL), 1 / np.asarray(NoV, np.float64)), 0.0)
+
+
+ENTRY = Model(
+    slot="masking",
+    name="neumann",
+    title="Neumann",
+    citation="Neumann1999",
+    parameters=(),
+    provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
+    reference={"V": _v, "G": _g},
+    facts={"reciprocal": True, "follows roughness": False},
+)

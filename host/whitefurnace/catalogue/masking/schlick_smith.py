@@ -1,0 +1,48 @@
+"""Schlick's approximation of a Smith term, by its own roughness."""
+import math
+
+import numpy as np
+
+from whitefurnace.catalogue.model import Model, Parameter
+
+
+def _k(alpha):
+    return np.asarray(alpha, np.float64) * math.sqrt(2 / math.pi)
+
+
+def _g1(NoV, at_v, alpha):
+    """As 1/(1 + Λ) with Λ = k (1/c - 1), infinite at c = 0."""
+    with np.errstate(divide="ignore"):
+        return 1 / (1 + _k(alpha) * (1 / np.asarray(NoV, np.float64) - 1))
+
+
+def _g(NoV, NoL, NoH, VoH, at_v, at_l, alpha):
+    NoL = np.asarray(NoL, np.float64)
+    return np.where(NoL > 0, _g1(NoV, at_v, alpha) * _g1(np.where(NoL > 0, NoL, 1.0), at_l, alpha), 0.0)
+
+
+def _v(NoV, NoL, NoH, VoH, at_v, at_l, alpha):
+    """A line in each cosine: k at 0, 1 at 1."""
+    k, NoL = _k(alpha), np.asarray(NoL, np.float64)
+    with np.errstate(divide="ignore"):
+        return np.where(NoL > 0, 1 / ((NoV * (1 - k) + k) * (NoL * (1 - k) + k)), 0.0)
+
+
+ENTRY = Model(
+    slot="masking",
+    name="schlick_smith",
+    title="Schlick's approximation of Smith",
+    citation="Schlick1994",
+    parameters=(
+        Parameter("alpha", "α", "1", 1e-5, 1.0, (1e-4, 0.01, 0.1, 0.5, 1.0),
+                  "roughness, the square of the perceptual one; that of the NDF, unless something else is wanted"),
+    ),
+    provides=("MASKING_AT", "MASKING_V", "MASKING_G", "MASKING_G1"),
+    reference={"V": _v, "G": _g, "G1": _g1},
+    from_roughness=lambda r: {"alpha": r * r},
+    facts={
+        "reciprocal": True,
+        "follows roughness": True,
+        # FACTS
+    },
+)
