@@ -25,6 +25,7 @@ ALLOWED: dict[str, set[str]] = {
     "cells": {"errors", "catalogue", "source", "device"},
     "derived": {"errors", "catalogue", "source", "device", "cells"},
     "run": {"errors", "catalogue", "recipe", "source", "plan", "device", "cells", "derived"},
+    "sampling": {"errors", "catalogue", "recipe", "device", "cells", "derived"},
     "certificate": set(),
     "sphere": {"catalogue", "plan", "environments"},
     "convolution": {"errors", "catalogue", "recipe", "source", "plan", "device", "environments", "sphere", "derived"},
@@ -33,7 +34,7 @@ ALLOWED: dict[str, set[str]] = {
     "baking": {"errors", "version", "catalogue", "recipe", "source", "plan", "device", "files", "engines",
                "environments", "run", "lighting"},
     "report": {"errors", "catalogue", "device", "baking"},
-    "__init__": {"version", "run", "lighting", "baking", "environments"},
+    "__init__": {"version", "run", "sampling", "lighting", "baking", "environments"},
     "cli": {"errors", "catalogue", "device", "baking", "report"},
     "__main__": {"cli"},
 }

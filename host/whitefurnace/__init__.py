@@ -22,15 +22,17 @@ _HOMES = {
     "integrate": "run",
     "irradiance": "lighting",
     "prefilter": "lighting",
+    "sample": "sampling",
 }
 
-__all__ = ["__version__", "bake", "dfg", "environment", "harmonics", "integrate", "irradiance", "prefilter"]
+__all__ = ["__version__", "bake", "dfg", "environment", "harmonics", "integrate", "irradiance", "prefilter", "sample"]
 
 if TYPE_CHECKING:
     from whitefurnace.baking import bake
     from whitefurnace.environments import environment
     from whitefurnace.lighting import harmonics, irradiance, prefilter
     from whitefurnace.run import dfg, integrate
+    from whitefurnace.sampling import sample
 
 
 def __getattr__(name: str) -> Any:
