@@ -13,7 +13,7 @@ import numpy as np
 from whitefurnace import plan as planning
 from whitefurnace import source
 from whitefurnace.catalogue import Model
-from whitefurnace.derived import lobe_norm, numbers_of
+from whitefurnace.derived import at_horizon, lobe_norm, numbers_of
 from whitefurnace.device import Buffer, Device, Kernel, Program
 from whitefurnace.environments import Environment, cube_solid_angles, latlong_solid_angles
 from whitefurnace.recipe import Chosen
@@ -209,7 +209,7 @@ class Convolver:
         if not len(index):
             return []
         smooth = planning.cuts_for(self.texel, min(lobe.alpha, planning.SHARP_ENOUGH), tolerance)
-        wanted = np.array([max(smooth, planning.bright_cuts(self.texel, lobe.alpha, tolerance, share))
+        wanted = np.array([max(smooth, planning.bright_cuts(self.texel, lobe.horizon, tolerance, share))
                            for share in self._bright_shares])
         lists = []
         for cuts in np.unique(wanted):
@@ -270,14 +270,14 @@ class Convolver:
         if n % 8:
             raise ValueError(f"a grid of {n} nodes an edge is not a multiple of the blocks' 8")
         self.prepare(n, planning.cuts_for(self.texel, lobe.alpha, tolerance, self.share))
-        split = planning.split_for(n, lobe.alpha)
+        split = planning.split_for(n, lobe.alpha, lobe.horizon)
         listed, bright = self._grid(n), self._bright_lists(lobe, tolerance)
         far = self._grid(split.grid) if split else None
         blocks = self.device.array(block_bounds(n).astype(self.kind)) if split else None
         group = self._step
         step = group * self.device.local_size
         count = listed.shape[0]
-        pairs = planning.pairs_of(1, n, lobe.alpha)
+        pairs = planning.pairs_of(1, n, lobe.alpha, lobe.horizon)
         tile = max(planning.PAIRS_A_LAUNCH // pairs // step, 1) * step
         order = shape.tiled()
         out = np.empty((shape.count, 3), np.float32)
@@ -487,21 +487,29 @@ class Convolver:
 
 @dataclass(frozen=True)
 class Lobe:
-    """A lobe to convolve with: an NDF at its parameters, or irradiance's cosine (model None)."""
+    """A lobe to convolve with: an NDF at its parameters, or irradiance's cosine (model None).
+
+    `alpha` says how sharp it is and `horizon` how hard its kink where l sets, both as GGX's α has them.
+    """
 
     name: str
     model: Model | None
     scalars: tuple[float, ...]
     norm: float
     alpha: float
+    horizon: float
 
 
 def ndf_lobe(device: Device, choice: Chosen, roughness: float, parameters: Mapping[str, Any]) -> Lobe:
     """The prefilter's lobe of an NDF; raises InputError for a user's that cannot be normalized."""
     entry = choice.model
-    numbers = numbers_of(device, entry, np.array([[parameters[p.name]] for p in entry.parameters]).reshape(-1, 1))
-    return Lobe(f"r = {roughness:.3f}", entry, tuple(numbers[:, 0].tolist()), lobe_norm(device, entry, parameters),
-                max(roughness * roughness, 1e-5))
+    rows = np.array([[parameters[p.name]] for p in entry.parameters], np.float64).reshape(-1, 1)
+    numbers = numbers_of(device, entry, rows)
+    norm = lobe_norm(device, entry, parameters)
+    # The slope of K/∫K at the horizon is α²/π for GGX. A lobe that lies there altogether (sheen) falls in 1/horizon.
+    horizon = math.sqrt(math.pi * at_horizon(device, entry, parameters) / norm)
+    return Lobe(f"r = {roughness:.3f}", entry, tuple(numbers[:, 0].tolist()), norm,
+                min(max(roughness * roughness, 1e-5), 1 / max(horizon, 1.0)), max(horizon, 1e-5))
 
 
-COSINE = Lobe("irradiance", None, (), math.pi, 1.0)
+COSINE = Lobe("irradiance", None, (), math.pi, 1.0, 1.0)

@@ -9,7 +9,8 @@ import numpy as np
 
 from whitefurnace import source
 from whitefurnace.catalogue import Model, integral
-from whitefurnace.catalogue.rule import AREA_RULES, LADDERS
+from whitefurnace.catalogue.registry import LOBE
+from whitefurnace.catalogue.rule import AREA_RULES, LADDERS, gauss
 from whitefurnace.cells import evaluate, over_nodes
 from whitefurnace.device import Device
 from whitefurnace.errors import InputError, UnsupportedError
@@ -40,8 +41,10 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct columns of (k, n) as (k, m), and for each of the n which of them it is."""
     if rows.shape[1] == 0 or rows.shape[0] == 0 or (rows == rows[:, :1]).all():
         return rows[:, :1], np.zeros(rows.shape[1], np.intp)
-    distinct, which = np.unique(rows, axis=1, return_inverse=True)
-    return distinct, which.reshape(-1)
+    # Grids come in runs of equal columns: sorting their heads alone is many times quicker.
+    heads = np.concatenate([[True], (rows[:, 1:] != rows[:, :-1]).any(0)])
+    distinct, which = np.unique(rows[:, heads], axis=1, return_inverse=True)
+    return distinct, which.reshape(-1)[np.cumsum(heads) - 1]
 
 
 def numbers_of(device: Device, entry: Model, rows: np.ndarray) -> np.ndarray:
@@ -168,10 +171,27 @@ class Areas:
 
 
 def lobe_norm(device: Device, entry: Model, parameters: Mapping[str, float]) -> float:
-    """∫ K dω of the prefilter's lobe of an NDF (catalogue.registry.LOBE), to rounding."""
-    from whitefurnace.catalogue.registry import LOBE
-
-    rows = np.array([[parameters[p.name]] for p in entry.parameters], np.float64).reshape(-1, 1)
-    cells = np.concatenate([np.ones((1, 1)), numbers_of(device, entry, rows)])
+    """∫ K dω of the prefilter's lobe K = D(h)(n·l), to rounding: from the entry's reference, by Gauss panels in the log
+    of s = 1 - l·r; of a user's NDF on the device (catalogue.registry.LOBE)."""
+    if entry.reference:
+        edges = np.concatenate([[0.0], np.geomspace(1e-14, 1.0, 57)])
+        x, w = gauss(12)
+        width = np.diff(edges)[:, None]
+        s = edges[:-1, None] + width * x
+        D = entry.reference["D"](np.arcsin(np.sqrt(s / 2)), **parameters)
+        return 2 * math.pi * float((width * w * D * (1 - s)).sum())
+    cells = np.concatenate([np.ones((1, 1)), numbers_of(device, entry, _row(entry, parameters))])
     return float(over_nodes(device, source.integration(LOBE, {"ndf": entry}).text, "integrate", cells, 1,
                             finest(device), LADDERS["polar"][-1])[0, 0])
+
+
+def at_horizon(device: Device, entry: Model, parameters: Mapping[str, float]) -> float:
+    """D(45°), the slope of the lobe where l sets."""
+    if entry.reference:
+        return float(entry.reference["D"](np.float64(math.pi / 4), **parameters))
+    cells = np.concatenate([np.array([[math.sqrt(0.5)], [0.5]]), numbers_of(device, entry, _row(entry, parameters))])
+    return float(evaluate(device, "NDF_D", {"ndf": entry}, cells, finest(device))[0, 0])
+
+
+def _row(entry: Model, parameters: Mapping[str, float]) -> np.ndarray:
+    return np.array([[parameters[p.name]] for p in entry.parameters], np.float64).reshape(-1, 1)

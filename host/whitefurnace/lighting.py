@@ -85,6 +85,9 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) ->
     for level in planning.plan_chain(recipe, convolver.texel, convolver.share):
         lobe = (None if level.roughness == 0 else
                 ndf_lobe(convolver.device, recipe.ndf, level.roughness, level.parameters))
+        if lobe and lobe.horizon > lobe.alpha:  # a tail heavier than GGX's
+            grid = max(level.grid, planning.grid_size(lobe.alpha, recipe.tolerance, lobe.horizon))
+            level = replace(level, grid=grid)
         jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size)))
     return jobs
 
@@ -107,7 +110,8 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> lis
     if any(job.lobe for job in jobs):
         convolver.prepare(max(job.plan.grid for job in jobs), max(job.plan.cuts for job in jobs if job.lobe))
     common = (time.perf_counter() - begin) / len(jobs)
-    work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0)
+    work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0,
+                              job.lobe.horizon if job.lobe else 1.0)
             for job in jobs]
     levels = []
     for k, job in enumerate(jobs):
@@ -162,7 +166,7 @@ def _references(convolver: Convolver, jobs: Sequence[Job], samples: Sequence[tup
             for k, values in zip(group, _exact(convolver, jobs, group, index, cuts, tolerance), strict=True):
                 references[k] = values
                 doubts[k] = planning.cuts_error(convolver.texel, _lobe(jobs[k]).alpha, cuts)
-        todo = [k for k in todo if _lobe(jobs[k]).alpha > planning.SHARP_ENOUGH and not convolver.constant]
+        todo = [k for k in todo if _lobe(jobs[k]).horizon > planning.SHARP_ENOUGH and not convolver.constant]
         again = []
         for cuts in sorted({jobs[k].plan.cuts for k in todo}):
             group = [k for k in todo if jobs[k].plan.cuts == cuts]
@@ -205,7 +209,7 @@ def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np
     method, pairs = "texel-mean", 0
     if job.lobe:
         method = f"anterpolated-{job.plan.grid}"
-        pairs = planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha)
+        pairs = planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha, job.lobe.horizon)
     scaled = (texels * (1 / convolver.scale)).astype(np.float32)  # a power of two: exact
     return Level(scaled, job.plan.roughness, error + rounding, worst + rounding, rmse, method, job.plan.grid, pairs,
                  seconds=0.0)

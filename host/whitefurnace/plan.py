@@ -69,18 +69,22 @@ class LevelPlan:
         return pairs_of(self.outputs, self.grid, max(self.roughness**2, 1e-5))
 
 
-def pairs_of(outputs: int, grid: int, alpha: float) -> int:
+def pairs_of(outputs: int, grid: int, alpha: float, horizon: float | None = None) -> int:
     """Lobe evaluations of `outputs` directions over a grid, as its split leaves them."""
-    split = split_for(grid, alpha) if grid else None
+    split = split_for(grid, alpha, horizon) if grid else None
     if split is None:
         return outputs * 6 * grid**2
     return int(outputs * 6 * (grid**2 * split.q1 / 4 + split.grid**2))
 
 
-def grid_size(alpha: float, tolerance: float) -> int:
-    """Nodes a face edge that a lobe of roughness α needs for a p99 texel error ≤ tolerance, a multiple of 8."""
+def grid_size(alpha: float, tolerance: float, horizon: float | None = None) -> int:
+    """Nodes a face edge that a lobe of roughness α needs for a p99 texel error ≤ tolerance, a multiple of 8.
+
+    `horizon` is the α whose kink where l sets is as hard as the lobe's, α itself for GGX.
+    """
+    horizon = alpha if horizon is None else horizon
     finer = (1e-3 / tolerance) ** (1 / ORDER)
-    n = max((SHARP / max(alpha, 1e-9) + MARGIN) * finer, FLOOR * finer + KINK * alpha * finer**2)
+    n = max((SHARP / max(alpha, 1e-9) + MARGIN) * finer, FLOOR * finer + KINK * horizon * finer**2)
     return min(max(8 * math.ceil(n / 8), 8), LARGEST_GRID)
 
 
@@ -114,15 +118,15 @@ def cuts_error(texel: float, alpha: float, cuts: int) -> float:
     return 1.3e-3 * x * x if cuts == 1 else 2.6e-5 * (2 * x / cuts) ** 4
 
 
-def bright_cuts(texel: float, alpha: float, tolerance: float, share: float) -> int:
+def bright_cuts(texel: float, horizon: float, tolerance: float, share: float) -> int:
     """Nodes an edge of a bright texel that holds `share` of all energy, a power of two.
 
     Where it sets, the kink of (n·l)₊ costs share·texel/(8 cuts²) of the mean; texels a thousand times darker
-    than the mean are held to the tolerance too, so the factor is 10³/8. Sharp lobes carry nothing there.
+    than the mean are held to the tolerance too, so the factor is 10³/8. Lobes with little at the `horizon` need none.
     """
-    if alpha <= SHARP_ENOUGH:
+    if horizon <= SHARP_ENOUGH:
         return 2
-    wanted = math.sqrt(125 * share * texel / tolerance)
+    wanted = max(horizon, 1.0) * math.sqrt(125 * share * texel / tolerance)
     return 2 ** min(max(1, math.ceil(math.log2(max(wanted, 1e-9)))), 9)
 
 
@@ -140,17 +144,18 @@ NEAR_ANGLE, FAR_NODES = 0.62, 28.0
 measured to leave the error as it is at a quarter of the time."""
 
 
-def split_for(n: int, alpha: float) -> Split | None:
+def split_for(n: int, alpha: float, horizon: float | None = None) -> Split | None:
     """How to part the work over an n × n grid, or None where the far part would cost as much as the whole.
 
     Near pairs grow with θ1², far ones with 1/θ1² since the far part is smooth on the scale θ1; the far grid
     must also carry the lobe's kink at the horizon. A finer n, for a tighter tolerance, refines both alike.
     """
+    horizon = alpha if horizon is None else horizon
     sharp = SHARP / alpha + MARGIN
     theta = NEAR_ANGLE * math.sqrt(192 / sharp)
     if theta > 1.0:
         return None
-    far = n / sharp * max(FAR_NODES / theta, FLOOR + KINK * alpha)
+    far = n / sharp * max(FAR_NODES / theta, FLOOR + KINK * horizon)
     far = 8 * math.ceil(far / 8)
     q1 = 2 - 2 * math.cos(theta)
     return Split(q1 / 16, q1, far) if far <= n / 2 else None

@@ -31,12 +31,17 @@ class Chosen:
         return {"name": self.model.name, **source, **dict(sorted(self.given.items()))}
 
 
-def chosen(slot: str, spec: str | Model) -> Chosen:
-    """A model from `NAME`, `NAME:PRESET`, `NAME:p=v,…`, `FILE.clh[:p=v,…]` or a catalogue entry.
+Spec = str | Model | Chosen
+
+
+def chosen(slot: str, spec: Spec) -> Chosen:
+    """A model from `NAME`, `NAME:PRESET`, `NAME:p=v,…`, `FILE.clh[:p=v,…]`, a catalogue entry or what was chosen.
 
     A value is a number, or three for RGB (`f0=1/.71/.29`). Raises UsageError with the nearest name, and what
     `user_model` raises of a file.
     """
+    if isinstance(spec, Chosen):
+        return spec
     if isinstance(spec, Model):
         return Chosen(spec, {})
     file, suffix, rest = spec.partition(".clh")
@@ -137,14 +142,15 @@ def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int = 16, tole
         raise UnsupportedError(f"ndf {choice.model.name} is anisotropic; only isotropic NDFs can be prefiltered")
     if choice.model.from_roughness is None:
         raise UnsupportedError(f"ndf {choice.model.name} has no parameter that follows roughness")
-    follows = choice.model.from_roughness(0.5)
+    smooth, rough = choice.model.from_roughness(0.3), choice.model.from_roughness(0.7)
+    follows = {name for name in rough if rough[name] != smooth[name]}  # the rest are defaults and can be given
     for name in choice.given:
         if name in follows:
             raise UsageError(f"ndf {choice.model.name}: {name} follows the roughness of each level and cannot be given")
     if any(isinstance(value, tuple) for value in choice.given.values()):
         raise UsageError(f"ndf {choice.model.name}: a chain takes one number a parameter, not three")
     missing = [p.name for p in choice.model.parameters
-               if p.name not in follows and p.name not in choice.given and p.default is None]
+               if p.name not in rough and p.name not in choice.given and p.default is None]
     if missing:
         raise UsageError(f"ndf {choice.model.name}: {', '.join(missing)} must be given, as "
                          f"{choice.model.name}:{missing[0]}=VALUE")

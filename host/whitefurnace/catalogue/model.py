@@ -42,6 +42,8 @@ class Model:
 
     `constants` gives float64 numbers that follow from the parameters alone, such as a norm; kernel functions take
     them, in the order of `constant_names`, after the parameters. `presets` are named parameter sets, RGB as three.
+    `limits` are exact values by name: each takes the parameters and gives the argument of the reference and its value,
+    NaN where there is none.
     `text` is the kernel text of a model from a user's file, `path` where it lies and `takes_sin2` whether its D wants
     sin²θ; a model of ours has a kernel file.
     """
@@ -61,6 +63,7 @@ class Model:
     constants: Callable[..., dict[str, np.ndarray]] | None = None
     constant_names: tuple[str, ...] = ()
     presets: Mapping[str, Mapping[str, float | tuple[float, float, float]]] = field(default_factory=dict)
+    limits: Mapping[str, Callable[..., tuple[Any, Any]]] = field(default_factory=dict)
     text: str | None = None
     path: str | None = None
     takes_sin2: bool = True

@@ -27,5 +27,9 @@ ENTRY = Model(
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f, "albedo": _albedo},
-    facts={"reciprocal": True},  # FACTS
+    facts={"reciprocal": True,
+           "energy": "conserving for exponents of 1 and more; below at most albedo · NoV^(exponent - 1), without bound "
+                     "at NoV = 0 (exponent .5: 10 at NoV = .01; exponent 0: 100)",
+           "largest albedo": np.inf,
+           "float32": "relative error ≤ 3e-7 (1 + |(k - 1) log(NoL NoV)|): 1e-6 at k = 0, cosines 1e-6"},
 )

@@ -30,5 +30,9 @@ ENTRY = Model(
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f},
-    facts={"reciprocal": True},  # FACTS
+    facts={"reciprocal": True,
+           "energy": "at most 1.0511 at NoV = 0 (albedo 1, σ = .304); above 1 for σ < .62, NoV < .31",
+           "largest albedo": 1.0511,
+           "negative": "down to -.27 albedo/π where both directions graze on opposite sides, for σ near π/2 and "
+                       "albedo < .84"},
 )

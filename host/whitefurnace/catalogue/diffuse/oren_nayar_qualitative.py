@@ -25,5 +25,7 @@ ENTRY = Model(
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f},
-    facts={"reciprocal": True},  # FACTS
+    facts={"reciprocal": True,
+           "energy": "at most 1.0152 at NoV = 0 (albedo 1, σ = .199); above 1 for σ < .33, NoV < .3",
+           "largest albedo": 1.0152},
 )

@@ -30,6 +30,7 @@ ENTRY = Model(
     facts={
         "at 0°": "((η - 1)² + κ²)/((η + 1)² + κ²)",
         "at 90°": "1, but 0 for η = 1, κ = 0",
-        # FACTS
+        "float32": "absolute error ≤ 5e-7 everywhere",
+        "critical angle": "for κ = 0, η < 1, F leaves 1 like a square root: float64 beside it is good to 1e-7",
     },
 )

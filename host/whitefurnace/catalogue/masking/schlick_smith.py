@@ -43,6 +43,11 @@ ENTRY = Model(
     facts={
         "reciprocal": True,
         "follows roughness": True,
-        # FACTS
+        # Below Smith everywhere but at n·v = 1, at grazing by Smith's slope over this one's: A(0)/(α√(2/π)).
+        "G1 less Smith's": "Beckmann: -.455, -.441, -.388, -.335 at most for α = .01, .1, .5, 1 "
+                           "(at n·v = .006, .06, .24, .39); GGX: -.270, -.249, -.177, -.116 (at .010, .09, .30, .39)",
+        "weak furnace, deviation": "Beckmann: down to -.646, 1/√8 - 1, at grazing for every α; "
+                                   "GGX: to -.388, -.380, -.373, -.373 for α = .01, .1, .5, 1",
+        "caution": "not the Smith term of any NDF: it approximates another function [Hoffman2012]; use smith",
     },
 )

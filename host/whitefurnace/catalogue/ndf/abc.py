@@ -64,7 +64,7 @@ ENTRY = Model(
     facts={
         "normalized": True,
         "tail": "D falls like (1 - cos θ)^-c",
-        "float32": "relative error of D at most 2.7e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
+        "float32": "relative error of D at most 3.5e-6 where D > 1e-7 of its peak; 2.5e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-38 of it",
         "limits": "uniform at b = 0 or c = 0; the norm is regular at c = 1 and c = 2",
     },

@@ -40,8 +40,8 @@ ENTRY = Model(
         "normalized": True,
         "projected area": "closed, with erf",
         "tail": "D falls like exp(-tan²θ/α²)",
-        "float32": "relative error of D at most 2.6e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-38 of it",
+        "float32": "relative error of D at most 5.5e-6 where D > 1e-7 of its peak; 6e-7 (1 + |log(D/peak)|) below, "
+                   "0 below 1e-34 of it",
         "limits": "D is 0 at grazing for every α",
     },
 )

@@ -43,8 +43,8 @@ ENTRY = Model(
         "normalized": True,
         "projected area": "closed, with erf",
         "tail": "D falls like exp(-tan²θ/α²)",
-        "float32": "relative error of D at most 5.7e-6 where D > 1e-7 of its peak; 5e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-38 of it",
+        "float32": "relative error of D at most 8e-6 where D > 1e-7 of its peak; 7e-7 (1 + |log(D/peak)|) below, "
+                   "0 below 1e-34 of it",
         "limits": "D is 0 at grazing for every α",
     },
 )

@@ -54,7 +54,7 @@ ENTRY = Model(
     facts={
         "normalized": True,
         "tail": "D falls like sin^-2γ θ",
-        "float32": "relative error of D at most 2.1e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
+        "float32": "relative error of D at most 3e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-38 of it",
         "limits": "GGX at γ = 2; uniform at γ = 0 or α = 1; the norm is regular at γ = 1",
     },

@@ -29,7 +29,7 @@ ENTRY = Model(
     facts={
         "normalized": True,
         "tail": "D falls like cosⁿθ, to 0 at grazing",
-        "float32": "relative error of D at most 2.4e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
+        "float32": "relative error of D at most 4e-6 where D > 1e-7 of its peak; 2.5e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-38 of it",
         "limits": "uniform at n = 0",
     },

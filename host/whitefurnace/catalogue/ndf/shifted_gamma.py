@@ -58,8 +58,8 @@ ENTRY = Model(
     facts={
         "normalized": True,
         "tail": "D falls like exp(-tan²θ/α), before it like (α² + tan²θ)^-p",
-        "float32": "relative error of D at most 3.2e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-38 of it",
+        "float32": "relative error of D at most 5.5e-6 where D > 1e-7 of its peak; 5e-7 (1 + |log(D/peak)|) below, "
+                   "0 below 1e-34 of it",
         "limits": "Beckmann of roughness √α at p = 0; the norm is regular for p ≥ 1",
     },
 )
