@@ -7,11 +7,11 @@ __kernel void area(__global scalar *restrict out, const int cells, const int fir
   if ((g + 1) * W > cells) return;
   CELL_LOAD
   const View v = view_of(cell_NoV, NDF_WIDTH, NDF_REACH);
-  real sum = (real)0;
+  real sum = (real)0, rest = (real)0;
   for (int k = 0; k < nodes; k++) {
     const Ring r = ring(v, k >= first, theta[2 * k], theta[2 * k + 1]);
     const real azimuths = cell_NoV * r.cos_m * r.phi_max + v.sin_v * r.sin_m * sin(r.phi_max);
-    sum += NDF_D(r.cos_m, r.sin2_m) * r.weight * azimuths;
+    add(&sum, &rest, NDF_D(r.cos_m, r.sin2_m) * r.weight * azimuths);
   }
   STORE(sum, g, out);
 }

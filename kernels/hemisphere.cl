@@ -21,8 +21,8 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
   const real3 v = vec3(sin_v * cos_phi_v, sin_v * sin_phi_v, NoV);
   const View view = view_of(NoV, (real)LOBE_WIDTH, (real)HALF_PI);
 #endif
-  real sum[COMPONENTS];
-  for (int c = 0; c < COMPONENTS; c++) sum[c] = (real)0;
+  real sum[COMPONENTS], rest[COMPONENTS];
+  for (int c = 0; c < COMPONENTS; c++) sum[c] = rest[c] = (real)0;
   for (int k = 0; k < nodes; k++) {
     const scalar x = theta[2 * k], w = theta[2 * k + 1];
 #ifdef SMOOTH
@@ -53,7 +53,7 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
 #endif
       scatter(inner, measure, l, v CELL_VALUES);
     }
-    for (int c = 0; c < COMPONENTS; c++) sum[c] += inner[c];
+    for (int c = 0; c < COMPONENTS; c++) add(&sum[c], &rest[c], inner[c]);
   }
   for (int c = 0; c < COMPONENTS; c++) STORE(sum[c], g, out + (size_t)c * cells);
 }

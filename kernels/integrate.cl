@@ -9,8 +9,8 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
   CELL_LOAD
   const View v = view_of(cell_NoV, NDF_WIDTH, NDF_REACH);
   const real at_v = MASKING_AT(v.NoV);
-  real sum[COMPONENTS];
-  for (int c = 0; c < COMPONENTS; c++) sum[c] = (real)0;
+  real sum[COMPONENTS], rest[COMPONENTS];
+  for (int c = 0; c < COMPONENTS; c++) sum[c] = rest[c] = (real)0;
   for (int k = 0; k < nodes; k++) {
     const Ring r = ring(v, k >= first, theta[2 * k], theta[2 * k + 1]);
     real inner[COMPONENTS];
@@ -22,7 +22,7 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
       integrand(inner, phi[2 * a + 1], f CELL_VALUES);
     }
     const real D = NDF_D(r.cos_m, r.sin2_m) * (r.weight * r.phi_max);
-    for (int c = 0; c < COMPONENTS; c++) sum[c] += inner[c] * D;
+    for (int c = 0; c < COMPONENTS; c++) add(&sum[c], &rest[c], inner[c] * D);
   }
   for (int c = 0; c < COMPONENTS; c++) STORE(sum[c], g, out + (size_t)c * cells);
 }

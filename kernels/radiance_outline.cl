@@ -50,8 +50,7 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
   for (int a = 0; a < alongs; a++) {
     real t, dt;
     graded(cell_scale, fabs(cell_length), along[2 * a], along[2 * a + 1], &t, &dt);
-    t = cell_length < 0 ? -t : t;
-    dt = cell_length < 0 ? -dt : dt;
+    t = cell_length < 0 ? -t : t;  // graded backwards; the way itself runs forwards
     const real ct = cos(t), st = sin(t);
     const real3 P = vec3(cell_Cx + cell_Ax * ct + cell_Bx * st, cell_Cy + cell_Ay * ct + cell_By * st,
                          fmax(cell_Cz + cell_Az * ct + cell_Bz * st, (real)0));

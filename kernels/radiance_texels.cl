@@ -14,7 +14,8 @@ __kernel void frame_nodes(__global scalar *restrict list, const int stride, cons
   const scalar full = texel_node(face, row - face * height, at % width, &d, &texel, TEXELS_VALUES);
   const scalar w = g < count && !(skip && skip[texel]) ? full : 0;
   __global const float *L = radiance + 3 * (size_t)texel;
-  for (int k = 0; k < 3; k++) list[(size_t)k * stride + g] = frame[3 * k] * d.x + frame[3 * k + 1] * d.y + frame[3 * k + 2] * d.z;
+  for (int k = 0; k < 3; k++)
+    list[(size_t)k * stride + g] = frame[3 * k] * d.x + frame[3 * k + 1] * d.y + frame[3 * k + 2] * d.z;
   list[3 * (size_t)stride + g] = w;
   for (int k = 0; k < 3; k++) list[(4 + (size_t)k) * stride + g] = w * L[k];
 }

@@ -1,12 +1,13 @@
 // Integrals over an anisotropic NDF: nodes in the stretched slopes, where it is isotropic. Lanes are cells.
 //
-// m = (αx r cos φ, αy r sin φ, 1)/|·|, r = tan ψ: dω = αx αy r dr dφ m.z³. At given φ, with e = (αx cos φ, αy sin φ)
+// m = (αx r cos φ, αy r sin φ, 1)/|·|, r = sinh u: dω = αx αy r dr dφ m.z³. At given φ, with e = (αx cos φ, αy sin φ)
 // and t the tangent vector of v over v.z, the support ends
 //   HALF_ANGLE (l above n):  r² e² - 2 r t·e < 1  =>  r = (t·e + √((t·e)² + e²))/e²
 //   POLAR (v·m > 0):         r < -1/(t·e) where t·e < 0
 // an analytic function of φ with one short scale: e/|T| about t·e = 0, T = (αx tx, αy ty), at grazing views. So φ
-// runs in four panels from there, each graded away from it, and ψ in one, from 0 to where the support ends.
-// out: [COMPONENTS][cells]; radial: (x, w) of ψ; azimuthal: (x, w) of a panel of φ.
+// runs in four panels from there, each graded away from it, and u in one, from 0 to where the support or the NDF ends:
+// the lobe at r = 1, its tail and the horizon at r = 1/α are all of size 1 in u.
+// out: [COMPONENTS][cells]; radial: (x, w) of u; azimuthal: (x, w) of a panel of φ.
 __kernel void integrate(__global scalar *restrict out, const int cells, const int radials,
                         __global const scalar *restrict radial, const int azimuths,
                         __global const scalar *restrict azimuthal CELL_ARRAYS) {
@@ -23,8 +24,8 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
   const real scale = fmin(across / fmax(T_, (real)1e-20f), (real)1), ratio = HALF_PI / scale;
   const real range = log(ratio + sqrt(ratio * ratio + 1));
   const real at_v = MASKING_AT(v);
-  real sum[COMPONENTS];
-  for (int c = 0; c < COMPONENTS; c++) sum[c] = (real)0;
+  real sum[COMPONENTS], rest[COMPONENTS];
+  for (int c = 0; c < COMPONENTS; c++) sum[c] = rest[c] = (real)0;
   for (int a = 0; a < 4 * azimuths; a++) {
     const int quarter = a & 3;
     const real u = range * azimuthal[2 * (a >> 2)], offset = fmin(scale * sinh(u), (real)HALF_PI);
@@ -35,15 +36,16 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
     const real te = T_ * cos_p;
 #ifdef HALF_ANGLE
     const real e2 = ex * ex + ey * ey, root = sqrt(te * te + e2);
-    const real end = te > 0 ? atan2(te + root, e2) : atan2((real)1, root - te);
+    const real last = te > 0 ? (te + root) / e2 : 1 / (root - te);
 #else
-    const real end = te < 0 ? atan2((real)1, -te) : (real)HALF_PI;
+    const real last = te < 0 ? -1 / te : (real)NDF_REACH;
 #endif
+    const real limit = fmin(last, (real)NDF_REACH), end = log(limit + sqrt(limit * limit + 1));
     real inner[COMPONENTS];
     for (int c = 0; c < COMPONENTS; c++) inner[c] = (real)0;
     for (int k = 0; k < radials; k++) {
-      // The bound keeps r finite where rounding takes ψ to π/2; D r³ is 0 long before.
-      const real psi = end * radial[2 * k], cos_psi = fmax(cos_0_pi(psi), (real)1e-7f), r = sin_half(psi) / cos_psi;
+      // sinh u cancels to a rounding of 1 near u = 0, where r dr has no weight.
+      const real e = exp_(end * radial[2 * k]), i = 1 / e, r = (e - i) / 2;
       const real z = 1 / sqrt(1 + sqr(r * ex) + sqr(r * ey));
       const real3 m = vec3(r * ex * z, r * ey * z, z);
       const real VoM = fmax(dot3(v, m), (real)0);
@@ -52,10 +54,10 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
       real node[COMPONENTS];
       for (int c = 0; c < COMPONENTS; c++) node[c] = (real)0;
       integrand(node, radial[2 * k + 1], f CELL_VALUES);
-      const real measure = NDF_D(m) * r * z * z * z / sqr(cos_psi);
+      const real measure = NDF_D(m) * r * z * z * z * ((e + i) / 2);
       for (int c = 0; c < COMPONENTS; c++) inner[c] += node[c] * measure;
     }
-    for (int c = 0; c < COMPONENTS; c++) sum[c] += inner[c] * (end * dphi);
+    for (int c = 0; c < COMPONENTS; c++) add(&sum[c], &rest[c], inner[c] * (end * dphi));
   }
   for (int c = 0; c < COMPONENTS; c++) STORE(sum[c] * (ax * ay), g, out + (size_t)c * cells);
 }

@@ -111,8 +111,8 @@ class Areas:
         self.device, self.entry, self.precision = device, entry, precision
         self._made: dict[bytes, tuple[np.ndarray, float]] = {}
 
-    def table(self, rows: np.ndarray) -> AreaTable:
-        """The table for cells of numbers (k, n), with as many terms as the worst of them needs.
+    def table(self, rows: np.ndarray, tolerance: float = 0.0) -> AreaTable:
+        """The table for cells of numbers (k, n), with as many terms as a tenth of `tolerance` needs.
 
         Raises UnsupportedError where A is infinite: D grows like 1/cos θ at grazing or faster.
         """
@@ -126,8 +126,10 @@ class Areas:
             self._make(distinct[:, part], [keys[k] for k in part])
         made = np.stack([self._made[key][0] for key in keys], 1)
         rest = np.cumsum(np.abs(made[3:]).max(1)[::-1])[::-1]
-        length = max(16, 16 * math.ceil(int((rest > AREA_KEPT[self.precision]).sum()) / 16))
-        return AreaTable(made[:3 + length, which], length, max(self._made[key][1] for key in keys))
+        # Every term costs a lane a multiply-add for each light direction: with all of them GGX is 10 times as fast.
+        length = max(16, 8 * math.ceil(int((rest > max(AREA_KEPT[self.precision], tolerance / 10)).sum()) / 8))
+        cut = float(rest[length]) if length < rest.size else 0.0
+        return AreaTable(made[:3 + length, which], length, cut + max(self._made[key][1] for key in keys))
 
     def _make(self, distinct: np.ndarray, keys: list[bytes]) -> None:
         precision, count, n = finest(self.device), AREA_NODES[self.precision], distinct.shape[1]

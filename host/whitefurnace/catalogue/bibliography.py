@@ -10,6 +10,7 @@ PAPERS = {
     "Fujii2012": "Y. Fujii, A Tiny Improvement of Oren-Nayar Reflectance Model, 2012",
     "Heitz2014": "E. Heitz, Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs, JCGT 3(2), 2014",
     "Hoffman2012": "N. Hoffman, Background: Physics and Math of Shading, SIGGRAPH 2012 course",
+    "Kahan1965": "W. Kahan, Further Remarks on Reducing Truncation Errors, Communications of the ACM 8(1), 1965",
     "Karis2013": "B. Karis, Real Shading in Unreal Engine 4, SIGGRAPH 2013 course",
     "Kelemen2001": "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with Importance "
                    "Sampling, Eurographics short presentations, 2001",

@@ -47,6 +47,8 @@ INTEGRALS = {
                  "2 ∫ E(μ) μ dμ"),
         Integral("dfg", "Split-sum pair", 2, ("NDF_D", "MASKING_V"), "HALF_ANGLE", True,
                  "(A, B) with E(v; F0) = F0·A + B, Schlick's F with F90 = 1"),
+        Integral("radiance", "Reflected radiance", 1, ("NDF_D", "MASKING_V", "FRESNEL_F", "LIGHT_L"), "LIGHT", True,
+                 "L_o(v) = ∫ f(l, v) L(l)(n·l) dω of a light or an environment"),
     )
 }
 

@@ -27,6 +27,15 @@ ENTRY = Model(
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
+    limits={
+        "0°": lambda eta, kappa: (1.0, ((eta - 1) ** 2 + kappa**2) / ((eta + 1) ** 2 + kappa**2)),
+        "90°": lambda eta, kappa: (0.0, np.where((eta == 1) & (kappa == 0), 0.0, 1.0)),
+        # κ = 0 is a dielectric. Below η = .05 Brewster's angle is the critical one to 1e-3, where any rounding counts.
+        "Brewster's angle": lambda eta, kappa: (1 / np.hypot(1, eta), np.where(
+            (kappa == 0) & (eta >= 0.05), ((1 - eta**2) / (1 + eta**2)) ** 2 / 2, np.nan)),
+        "total internal reflection": lambda eta, kappa: (np.sqrt(np.maximum(1 - eta**2, 0)) / 2, np.where(
+            (kappa == 0) & (eta < 1), 1.0, np.nan)),
+    },
     facts={
         "at 0°": "((η - 1)² + κ²)/((η + 1)² + κ²)",
         "at 90°": "1, but 0 for η = 1, κ = 0",

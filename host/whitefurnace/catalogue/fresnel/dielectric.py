@@ -26,6 +26,15 @@ ENTRY = Model(
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
+    limits={
+        "0°": lambda ior: (1.0, ((ior - 1) / (ior + 1)) ** 2),
+        "90°": lambda ior: (0.0, np.where(ior == 1, 0.0, 1.0)),
+        # tan θ = n, where r_p is 0 and r_s = (1 - n²)/(1 + n²).
+        "Brewster's angle": lambda ior: (1 / np.hypot(1, ior), ((1 - ior**2) / (1 + ior**2)) ** 2 / 2),
+        # cos θ of half the critical one's: sin²θ > n².
+        "total internal reflection": lambda ior: (np.sqrt(np.maximum(1 - ior**2, 0)) / 2,
+                                                  np.where(ior < 1, 1.0, np.nan)),
+    },
     facts={
         "at 0°": "((n - 1)/(n + 1))²",
         "at 90°": "1, but 0 for n = 1",

@@ -11,5 +11,6 @@ ENTRY = Model(
     parameters=(),
     provides=("FRESNEL_F",),
     reference={"F": lambda cos_d: np.ones_like(np.asarray(cos_d, np.float64))},
+    limits={"0°": lambda: (1.0, 1.0), "90°": lambda: (0.0, 1.0)},
     facts={"at 0°": "1", "at 90°": "1"},
 )

@@ -39,6 +39,7 @@ ENTRY = Model(
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
+    limits={"0°": lambda f0, f90: (1.0, f0), "90°": lambda f0, f90: (0.0, f90)},
     facts={"at 0°": "f0", "at 90°": "f90", "presets": "F(0°), linear, from the tables of [Hoffman2012]"},
     presets={name: {"f0": f0} for name, f0 in _METALS.items()} |
             {name: {"f0": (f0, f0, f0)} for name, f0 in _INSULATORS.items()},

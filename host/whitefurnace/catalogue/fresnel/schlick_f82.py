@@ -24,6 +24,7 @@ ENTRY = Model(
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
+    limits={"0°": lambda f0, f82: (1.0, f0), "81.8°": lambda f0, f82: (1 / 7, f82), "90°": lambda f0, f82: (0.0, 1.0)},
     facts={"at 0°": "f0", "at 81.8°": "f82", "at 90°": "1",
            "range": "[0, 1] for f82 from 25/49 S to S, Schlick's S = f0 + (1 - f0)(6/7)⁵ at cos θ = 1/7; down to "
                     "-.127 below (f0 = f82 = 0, at cos θ = .26) and up to 1.127 above (f0 = 0, f82 = 1, at .06)"},
