@@ -11,13 +11,9 @@
 // by t = s sinh(Rx). The inner path is graded from n by the lobe's width and from its end, where l may set.
 // out: [COMPONENTS][panels]; theta: (x, w) of the inner path, `first` from n, the rest from its end; along: (x, w) of t.
 
-typedef struct {
-  real theta, weight;  // weight: sin θ dθ
-} Step;
-
-// ∫ over [0, length] of a variable y = s sinh(Rx): y and dy.
-static inline void graded(real s, real length, scalar x, scalar w, real *y, real *dy) {
-  const real ratio = length / s, range = log(ratio + sqrt(ratio * ratio + 1)), u = range * x;
+// ∫ over [0, length] of a variable y = s sinh(Rx): y and dy. s is at most the length: log cancels for a ratio below 1.
+static inline void graded(real scale, real length, scalar x, scalar w, real *y, real *dy) {
+  const real s = fmin(scale, length), ratio = length / s, range = log(ratio + sqrt(ratio * ratio + 1)), u = range * x;
   const real e = exp(u), i = 1 / e;
 #if PRECISION == 64
   const real sinh_u = sinh(u);

@@ -21,8 +21,9 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
   // Unit vectors of the stretched azimuth of v, and across it.
   const real ux = T_ > 0 ? tx / T_ : (real)1, uy = T_ > 0 ? ty / T_ : (real)0;
   const real across = sqrt(sqr(ax * uy) + sqr(ay * ux));
-  const real scale = fmin(across / fmax(T_, (real)1e-20f), (real)1), ratio = HALF_PI / scale;
-  const real range = log(ratio + sqrt(ratio * ratio + 1));
+  const real ratio = HALF_PI / fmin(across / fmax(T_, (real)1e-20f), (real)1);
+  // From the rounded range the scale follows again, so that the panels end at π/2: 1e-6 of their length counts.
+  const real range = log(ratio + sqrt(ratio * ratio + 1)), scale = HALF_PI / sinh(range);
   const real at_v = MASKING_AT(v);
   real sum[COMPONENTS], rest[COMPONENTS];
   for (int c = 0; c < COMPONENTS; c++) sum[c] = rest[c] = (real)0;
