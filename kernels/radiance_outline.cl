@@ -69,11 +69,11 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
     const real middle = fmin(theta_v, end);  // where Oren and Nayar's maximum of two angles has its kink
 #else
 #ifdef ANISOTROPIC
-    const real width = 1 / sqrt(sqr(cx / ax) + sqr(cy / ay)), upper = end, sets = NoV + l.z;
+    const real width = 1 / sqrt(sqr(cx / ax) + sqr(cy / ay)), upper = end, sets = fmin(NoV, width) + l.z;
 #elif defined(WHOLE)
-    const real upper = end, sets = NoV + l.z;
+    const real upper = end, sets = fmin(NoV, width) + l.z;
 #else
-    const real upper = fmin(end, reach), sets = end > reach ? (real)1 : NoV + l.z;
+    const real upper = fmin(end, reach), sets = end > reach ? (real)1 : fmin(NoV, width) + l.z;
 #endif
     const real middle = upper / 2;
 #endif
@@ -88,7 +88,7 @@ __kernel void integrate(__global scalar *restrict out, const int cells, const in
       const real3 to = vec3(sin_t * cx, sin_t * cy, cos_t);
       scatter(inner, weight * sin_t * cos_t, to, v CELL_VALUES);
 #else
-      // From its end the path is graded by the cosine at which masking turns, where l sets beside a grazing view.
+      // From its end the path is graded by the cosine n·l at which masking turns.
       const real s = k < first ? fmin(width, (real)1) : fmin(fmax(sets, (real)1e-3f), (real)1);
       graded(s, fmax(middle, (real)1e-30f), x, w, &angle, &weight);
       angle = k < first ? angle : upper - angle;
