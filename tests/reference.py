@@ -1,5 +1,5 @@
 """Float64 truths for tests, in NumPy and in other forms than the kernels: lobes over environments, GGX's albedo
-with the azimuth in closed form, the albedo of any models over light directions."""
+with the azimuth in closed form, the albedo of any models over light directions by tanh-sinh."""
 from __future__ import annotations
 
 import math
@@ -153,28 +153,66 @@ def ggx_albedo_1d(NoV: np.ndarray, alpha: np.ndarray, n: int = 96,
     return total, fresnel
 
 
-# ------------------------------------------------------------------------------------- any models, over l
+# ------------------------------------------------------------------------------------- any models, by tanh-sinh
 
 
-def albedo_over_lights(D: Callable[[np.ndarray], np.ndarray], G: Callable[[np.ndarray, np.ndarray], np.ndarray],
-                       F: Callable[[np.ndarray], np.ndarray], NoV: float, width: float, n: int = 96) -> float:
-    """E = ∫ F(v·h) D(n·h) G(n·v, n·l) / (4 n·v) dω_l, by Gauss panels in θ_l and φ graded around the mirror
-    direction. `width` is the polar angle in which D falls; good to 1e-7 for width ≥ .2 and n·v ≥ .3."""
-    tv = math.acos(NoV)
-    x, w = gauss(n)
+def double_exponential(step: float = 1 / 12, reach: float = 3.2) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Tanh-sinh nodes on [0, 1]: x, 1 - x (neither cancels) and weights. They crowd at both ends beyond any scale,
+    so a peak of unknown width is resolved where a panel ends at it."""
+    y = math.pi / 2 * np.sinh(np.arange(-reach, reach + step / 2, step))
+    x, rest = 1 / (1 + np.exp(-2 * y)), 1 / (1 + np.exp(2 * y))
+    return x, rest, 2 * np.sqrt(y * y + (math.pi / 2) ** 2) * x * rest * step
+
+
+def smith_area(D: Callable[[np.ndarray], np.ndarray], below: np.ndarray, step: float = 1 / 12) -> np.ndarray:
+    """A(v) = ∫ D (v·m)₊ dω at views `below` radians above the horizon, of a D(θ), in θ_m with the azimuth in closed form:
+    ∫ (v·m)₊ dφ = 2 (cos θv cos θm φ1 + sin θv sin θm sin φ1), cos φ1 = -cot θv cot θm."""
+    x, rest, w = double_exponential(step)
+    up = np.asarray(below, np.float64)[:, None]
+    c, s = np.sin(up), np.cos(up)
+    total = np.zeros(up.shape[0])
+    for start, length, whole in ((0.0, up, True), (up, math.pi / 2 - up, False)):
+        theta, left = start + length * x, (math.pi / 2 - length if whole else 0.0) + length * rest
+        cos_m, sin_m = np.sin(left), np.sin(theta)
+        edge = np.clip(-c * cos_m / np.maximum(s * sin_m, 1e-300), -1, 1)
+        phi = np.full_like(theta, math.pi) if whole else np.arccos(edge)
+        total += (D(theta) * sin_m * 2 * (c * cos_m * phi + s * sin_m * np.sin(phi)) * length * w).sum(1)
+    return total
+
+
+def albedo_by_tanh_sinh(D: Callable[..., np.ndarray], V: Callable[..., np.ndarray],
+                        F: Callable[[np.ndarray], np.ndarray], area: Callable[..., np.ndarray], NoV: float,
+                        phi_v: float | None = None, step: float = 1 / 16) -> float:
+    """E = ∫ F(v·h) D(h) V/4 (n·l) dω_l over light directions, by tanh-sinh panels in θ_l that meet at the view's angle
+    and in the azimuth that meet at the mirror direction's and opposite to it: whatever the lobe's width, its peak is
+    where panels meet.
+
+    Isotropic without `phi_v`: D(θ), area(radians above the horizon); else D(θ, φ), area(θ, φ). V as entries have it.
+    """
+    x, rest, w = double_exponential(step)
+    above = math.asin(NoV)
+    theta_v = math.pi / 2 - above
+    at_v = area(np.array([above]))[0] if phi_v is None else area(np.array(theta_v), np.array(phi_v))
+    away = math.pi * x
+    lag = 2 * np.sin(away / 2) ** 2  # 1 - cos
     total = 0.0
-    rest = (math.pi / 2 - tv) / 2
-    for start, sign, length in ((tv, -1, tv), (tv, 1, rest), (math.pi / 2, -1, rest)):
-        span = math.asinh(length / width)
-        theta = start + sign * width * np.sinh(span * x)
-        dtheta = width * np.cosh(span * x) * span * w
-        around = width / math.sin(max(tv, width))
-        span = math.asinh(math.pi / around)
-        phi, dphi = around * np.sinh(span * x), around * np.cosh(span * x) * span * w
-        lz, sl = np.cos(theta)[:, None], np.sin(theta)[:, None]
-        l_x, l_y = sl * np.cos(phi), sl * np.sin(phi)
-        h = np.stack([l_x + math.sin(tv), l_y, np.broadcast_to(lz + NoV, l_x.shape)])
-        size = np.sqrt((h * h).sum(0))
-        value = F(size / 2) * D(h[2] / size) * G(np.full_like(l_x, NoV), np.broadcast_to(lz, l_x.shape)) / (4 * NoV)
-        total += float(np.einsum("ij,i,j->", value, (np.sin(theta) * dtheta), 2 * dphi))
+    for up, apart, length in ((above + theta_v * x, theta_v * x, theta_v), (above * rest, -above * x, above)):
+        NoL, sin_l = np.sin(up)[:, None], np.cos(up)[:, None]
+        # l + v with v's azimuth as x: sin θv - sin θl of the mirror direction without cancellation, then what lags.
+        h_x = 2 * np.cos((theta_v + math.pi / 2 - up) / 2)[:, None] * np.sin(apart / 2)[:, None] + sin_l * lag
+        h_z = NoL + NoV
+        at_l = area(up)[:, None] if phi_v is None else None
+        for side in (1.0,) if phi_v is None else (1.0, -1.0):
+            h_y = -side * sin_l * np.sin(away)
+            flat = np.hypot(h_x, h_y)
+            theta_h, size = np.arctan2(flat, h_z), np.hypot(flat, h_z)
+            if phi_v is None:
+                density, seen = D(theta_h), at_l
+            else:
+                density = D(theta_h, np.arctan2(h_y, h_x) + phi_v)
+                theta_l = np.broadcast_to((math.pi / 2 - up)[:, None], theta_h.shape)
+                seen = area(theta_l, phi_v + math.pi + side * away)
+            VoH = np.minimum(size / 2, 1.0)
+            value = F(VoH) * density * V(NoV, NoL, h_z / size, VoH, at_v, seen) / 4 * NoL * sin_l
+            total += float(np.einsum("ij,i,j->", value, length * w, math.pi * w)) * (2 if phi_v is None else 1)
     return total

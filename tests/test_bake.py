@@ -400,10 +400,49 @@ def test_no_output_or_no_input_is_a_usage_error(tmp_path, shell):
     assert shell("bakee") == 1
 
 
-def test_a_model_from_a_file_is_not_supported_yet(tmp_path, shell):
-    source = image(tmp_path / "a.exr", noise(height=2))
-    assert shell("bake", source, "-o", tmp_path / "out", "--ndf", "my_lobe.clh:alpha=0.3") == 5
-    assert "my_lobe.clh" in shell.sentence()
+MY_GGX = """real ndf_my_lobe_D(real cos_m, real sin2_m, real alpha, real scale) {
+  const real t = alpha * alpha + (1 - alpha) * (1 + alpha) * sin2_m;
+  return scale * sqr(alpha / t);
+}
+"""
+
+
+def test_a_model_from_a_file(tmp_path, shell):
+    """GGX of any scale bakes as GGX does; the key is of the file's text, not of its name."""
+    source, lobe = image(tmp_path / "a.exr", noise(height=16)), tmp_path / "my_lobe.clh"
+    lobe.write_text(MY_GGX)
+    for name, ndf in (("theirs", "ggx"), ("mine", f"{lobe}:scale=3")):
+        assert shell("bake", source, "-o", tmp_path / name, *SMALL, "--ndf", ndf) == 0, shell.err
+    theirs, mine = load(tmp_path / "theirs"), load(tmp_path / "mine")
+    for k in range(len(LEVELS)):
+        # Each is within the tolerance of the truth.
+        assert np.abs(mine[f"specular_{k}"] / theirs[f"specular_{k}"] - 1).max() <= 2e-3
+    assert np.abs(mine["dfg"] - theirs["dfg"]).max() <= 1e-5  # two tables of 5e-6
+    key = verified(tmp_path / "mine")["key"]
+    assert shell("bake", source, "-o", tmp_path / "mine", *SMALL, "--ndf", f"{lobe}:scale=3") == 0
+    assert "up to date" in shell.out
+    lobe.write_text(MY_GGX.replace("sqr(alpha / t)", "alpha / t"))
+    assert shell("bake", source, "-o", tmp_path / "mine", *SMALL, "--ndf", f"{lobe}:scale=3") == 0, shell.err
+    assert verified(tmp_path / "mine")["key"] != key
+
+
+@pytest.mark.parametrize("text, options, code, words", [
+    (MY_GGX, "", 1, "scale must be given"),
+    (MY_GGX, ":scale=3,alpha=.2", 1, "alpha follows"),
+    (MY_GGX, ":scle=3", 1, "scale"),
+    (None, ":scale=3", 2, "my_lobe.clh"),
+    (MY_GGX.replace("my_lobe", "other"), ":scale=3", 3, "ndf_my_lobe_D"),
+    (MY_GGX.replace("scale *", "-scale *"), ":scale=3", 3, "negative"),
+    ("real ndf_my_lobe_D(real cos_m, real a) { return a; }", ":a=1", 5, "roughness"),
+    ("real ndf_my_lobe_D(real cos_m, real alpha) { return cosm; }", "", 4, "cosm"),
+], ids=["parameter missing", "parameter that follows", "unknown parameter", "no file", "other function", "negative",
+        "no alpha", "does not compile"])
+def test_models_from_files_that_cannot_be_baked(tmp_path, shell, text, options, code, words):
+    source, lobe = image(tmp_path / "a.exr", noise(height=4)), tmp_path / "my_lobe.clh"
+    if text is not None:
+        lobe.write_text(text)
+    assert shell("bake", source, "-o", tmp_path / "out", *SMALL, "--ndf", f"{lobe}{options}") == code
+    assert words in shell.err and not (tmp_path / "out").exists()
 
 
 def test_an_unknown_device_is_a_usage_error(tmp_path, shell):

@@ -32,11 +32,15 @@ def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
-    """Small images under the names that the README uses, all of them EXR whatever the name says."""
+    """Small images under the names that the README uses, all of them EXR whatever the name says, and its models."""
     where = tmp_path_factory.mktemp("readme")
     rng = np.random.default_rng(7)
     for name in ("studio.hdr", "day.exr", "night.exr", "forest_1k.exr"):
         write_exr(where / name, rng.random((16, 32, 3), np.float32))
+    for block in blocks("c"):
+        name = re.search(r"(?:ndf|brdf)_(\w+)_[Df]\(", block)
+        assert name, block
+        (where / f"{name[1]}.clh").write_text(block)
     return where
 
 
@@ -73,7 +77,7 @@ def test_the_table_of_layouts_names_every_layout():
 
 
 def test_the_options_of_the_readme_exist():
-    told = run("bake", "--help").stdout
+    told = "".join(run(command, "--help").stdout for command in ("bake", "lut", "verify", "models", "devices"))
     for option in set(re.findall(r"`(--[a-z-]+)", README)):
         assert option in told, option
 
@@ -92,3 +96,15 @@ def test_help_is_quick_to_import():
               "sys.exit(f'imported {heavy}' if heavy else 0)")
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+def test_the_diff_of_a_model_is_its_files():
+    added: dict[str, list[str]] = {}
+    for line in blocks("diff")[0].splitlines():
+        if line.startswith("+++ b/"):
+            lines = added.setdefault(line[6:], [])
+        elif line.startswith("+"):
+            lines.append(line[1:])
+    assert len(added) == 2
+    for path, text in added.items():
+        assert (ROOT / path).read_text("utf-8").splitlines() == text, path

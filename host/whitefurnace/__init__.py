@@ -19,20 +19,24 @@ _HOMES = {
     "dfg": "run",
     "environment": "environments",
     "harmonics": "lighting",
-    "integrate": "run",
+    "integrate": "integrals",
     "irradiance": "lighting",
+    "lut": "tables",
     "prefilter": "lighting",
     "sample": "sampling",
 }
 
-__all__ = ["__version__", "bake", "dfg", "environment", "harmonics", "integrate", "irradiance", "prefilter", "sample"]
+__all__ = ["__version__", "bake", "dfg", "environment", "harmonics", "integrate", "irradiance", "lut", "prefilter",
+           "sample"]
 
 if TYPE_CHECKING:
     from whitefurnace.baking import bake
     from whitefurnace.environments import environment
+    from whitefurnace.integrals import integrate
     from whitefurnace.lighting import harmonics, irradiance, prefilter
-    from whitefurnace.run import dfg, integrate
+    from whitefurnace.run import dfg
     from whitefurnace.sampling import sample
+    from whitefurnace.tables import lut
 
 
 def __getattr__(name: str) -> Any:

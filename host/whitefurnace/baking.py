@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace import source
-from whitefurnace.catalogue import INTEGRALS, model
+from whitefurnace.catalogue import INTEGRALS, Model, model
 from whitefurnace.device import Device, choose_device
 from whitefurnace.engines import Engine, engines
 from whitefurnace.environments import Environment, environment
@@ -158,7 +158,7 @@ def _bake_one(request: Order, k: int, device: Device | str | None, dry_run: bool
     env = environment(item, rotate=request.rotate, exposure=request.exposure,
                       nonfinite=request.nonfinite)  # type: ignore[arg-type]
     recipe = _canonical(request, env)
-    key = _key(env, recipe)
+    key = _key(env, recipe, request.recipe.ndf.model)
     targets = _targets(request, name)
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
     planned = plan_chain(request.recipe, texel)
@@ -196,7 +196,7 @@ def _make(request: Order, k: int, env: Environment, recipe: dict[str, Any], key:
     on = on or choose_device(device if isinstance(device, str) else None)
     tell = (lambda what, share: progress(name, what, share)) if progress else None
     lit = light(on, env, request.recipe, latlong=any(e.latlong for e in request.engines), seed=key, progress=tell)
-    table = dfg(DFG_SIZE, ndf=request.recipe.ndf.model, tolerance=DFG_TOLERANCE, device=on)
+    table = dfg(DFG_SIZE, ndf=request.recipe.ndf, tolerance=DFG_TOLERANCE, device=on)
     manifest = _manifest(name, env, recipe, key, on, lit, table)
     with Transaction() as transaction:
         digests = {}
@@ -219,7 +219,7 @@ def _make(request: Order, k: int, env: Environment, recipe: dict[str, Any], key:
     rows = tuple({**row, "seconds": s} for row, s in zip(manifest["levels"], seconds, strict=True))
     targets = _targets(request, name)
     return Baked(name, "done", tuple(t.path for t in targets), manifest, planned, tuple(t.nbytes for t in targets),
-                 env.notices, rows, time.perf_counter() - begin)
+                 (*env.notices, *table.notices), rows, time.perf_counter() - begin)
 
 
 def _superseded(request: Order, there: dict[str, Any] | None,
@@ -252,9 +252,8 @@ def _canonical(request: Order, env: Environment) -> dict[str, Any]:
             "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE}}
 
 
-def _key(env: Environment, recipe: dict[str, Any]) -> str:
+def _key(env: Environment, recipe: dict[str, Any], ndf: Model) -> str:
     """sha256 over the source bytes, the canonical recipe, the kernels and the version."""
-    ndf = model("ndf", recipe["ndf"]["name"])
     slots = {"ndf": ndf, "masking": model("masking", "smith")}
     texts = [source.texels(env.kind), source.overlap(), source.convolution(ndf), source.convolution(None),
              source.integration(INTEGRALS["dfg"], slots)]

@@ -47,10 +47,12 @@ def over_nodes(device: Device, text: str, kernel: str, cells: np.ndarray, compon
 
 
 def evaluate(device: Device, function: str, slots: Mapping[str, Model], cells: np.ndarray,
-             precision: int) -> np.ndarray:
+             precision: int, area_terms: int = 0) -> np.ndarray:
     """(components, n): a model function (`NDF_D`, `FRESNEL_F`, …) at its own arguments and the models' numbers.
 
-    cells: (rows, n), the arguments first (three rows for a vector), then parameters and constants of each slot.
+    cells: (rows, n), the arguments first (three rows for a vector), then parameters and constants of each slot, then
+    the table of Smith's area of `area_terms` terms where the masking reads one.
     """
     components = 3 if function == "BRDF_F" else 1
-    return over_cells(device, source.evaluation(function, slots).text, "evaluate", cells, components, precision)
+    return over_cells(device, source.evaluation(function, slots, area_terms).text, "evaluate", cells, components,
+                      precision)

@@ -100,6 +100,166 @@ def bake(environments: tuple[str, ...], output: Path, for_: str, device: str | N
             f"{len(failures)} of {len(order.names)} environments failed")
 
 
+EPILOG_LUT = """\b
+Examples:
+  whitefurnace lut dfg -o dfg.npy --size 256
+  whitefurnace lut albedo -o gold.exr --fresnel schlick:gold --size 64x32
+  whitefurnace lut albedo -o sheen.npy --ndf charlie --axis alpha=.01:1:64:log --tolerance 1e-4
+  whitefurnace lut albedo_average -o average.npy --fresnel schlick --axis f0=0:1:32
+  whitefurnace lut albedo -o diffuse.npy --diffuse burley --set albedo=.8
+  whitefurnace lut radiance -o lit.exr --light punctual --set NoL=.5 --set color=1 --tolerance 1e-4
+
+\b
+The array is [y, x] or [y, x, channel], with more axes before them. x is NoV = (x + ½)/N, y perceptual roughness
+r = (y + ½)/M, row 0 smoothest, which the models' own parameters follow (α = r² for GGX). An integral without a view
+has r alone, as x. --set fixes a parameter (NoV, roughness, phi, a model's own, or ndf_alpha for that of one slot) and
+drops the axis that would vary it; --axis NAME=A:B:N takes the place of the default axis of that name, or comes after
+the others, slower. A and B are its ends, unless its scale is `centres`. FILE.json beside FILE tells what is in it.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported,
+7 a check failed, 130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_LUT)
+@click.argument("kind")
+@click.option("-o", "--output", metavar="FILE", required=True, type=click.Path(path_type=Path),
+              help="The table, .npy or .exr (float32, two axes).")
+@click.option("--size", metavar="N|NxM", default="128", show_default=True, help="Cells along x and y, 1 to 16384.")
+@click.option("--axis", "axes", metavar="NAME=A:B:N[:SCALE]", multiple=True,
+              help="A parameter from A to B in N steps; SCALE is linear, log or centres. Several are several axes.")
+@click.option("--set", "fixed", metavar="NAME=VALUE", multiple=True, help="Fix a parameter.")
+@click.option("--ndf", metavar="NAME[:p=v,...]", help="Or FILE.clh. [default: ggx, without a --diffuse or --brdf]")
+@click.option("--masking", metavar="NAME", help="[default: smith]")
+@click.option("--fresnel", metavar="NAME[:p=v,...]", help="Or NAME:PRESET, as schlick:gold. [default: one]")
+@click.option("--diffuse", metavar="NAME[:p=v,...]", help="Added to what the NDF reflects, or alone; for albedos.")
+@click.option("--brdf", metavar="FILE.clh", help="A whole BRDF of your own; for albedos, in RGB.")
+@click.option("--light", metavar="NAME[:p=v,...]", help="Of radiance: punctual, ambient, disc or rectangle.")
+@click.option("--environment", metavar="ENV", help="Of radiance, instead of a light: an image, in RGB.")
+@click.option("--normal", metavar="X Y Z", type=float, nargs=3, help="Of the surface in the environment. [default: 0 1 0]")
+@click.option("--rotate", metavar="DEG", type=float, default=0.0, help="Turn the environment about +Y, +X towards +Z.")
+@click.option("--exposure", metavar="EV", type=float, default=0.0, help="Multiply its radiance by 2^EV.")
+@click.option("--nonfinite", metavar="refuse|zero", default="refuse", help="What to do with its NaN and infinite values.")
+@click.option("--backfacing", metavar="clamp|absolute", help="Views with NoV < 0. [default: refused]")
+@click.option("--precision", type=int, default=32, show_default=True, help="32 or 64.")
+@click.option("--tolerance", metavar="X", type=float, help="Absolute. [default: 1e-6, 1e-12 for precision 64]")
+@click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done and written, and do nothing.")
+@click.option("--force", is_flag=True, help="Make it again, and replace a file that is not known to be ours.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
+@click.option("--quiet", is_flag=True, help="Print errors only.")
+def lut(kind: str, output: Path, axes: tuple[str, ...], fixed: tuple[str, ...], device: str | None, dry_run: bool,
+        as_json: bool, quiet: bool, **options: Any) -> None:
+    """Write a table of an integral over a grid of parameters.
+
+    KIND is normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance.
+    """
+    from whitefurnace import report, tables
+
+    request = tables.order(kind, output, axes=_named("--axis", axes), parameters=_named("--set", fixed), **options)
+    with _progress(not (quiet or as_json)) as tell:
+        made = tables.make(request, device, dry_run=dry_run, progress=tell)
+    for notice in () if quiet else made.notices:
+        _say(f"notice: {made.path.name}: {notice}")
+    if as_json:
+        _json(report.table_row(made))
+    elif not quiet:
+        click.echo(report.table_text(made))
+
+
+def _named(option: str, given: tuple[str, ...]) -> dict[str, str]:
+    """NAME=VALUE options by name."""
+    from whitefurnace.errors import UsageError
+
+    found: dict[str, str] = {}
+    for item in given:
+        name, equals, value = item.partition("=")
+        if not (name.isidentifier() and equals and value) or name in found:
+            raise UsageError(f"{option} {item!r}: {name or 'a name'} must be given once, as NAME=VALUE")
+        found[name] = value
+    return found
+
+
+EPILOG_VERIFY = """\b
+Examples:
+  whitefurnace verify
+  whitefurnace verify ggx smith burley --precision 32
+  whitefurnace verify gtr:gamma=2 schlick:gold --plot figures
+  whitefurnace verify my_lobe.clh:alpha=.3 my_brdf.clh:roughness=.5 --json
+
+\b
+A row is the worst of all cells of a check: its value, what is expected (equal, or a bound), the error and what is
+tolerated, all absolute. A model is checked for what its entry declares; `whitefurnace models NAME` shows that. What is
+`told` is measured and not judged. A file defines ndf_STEM_D or brdf_STEM_f, and all its parameters must be given.
+
+\b
+Exit codes: 0 all passed, 1 usage, 2 cannot read or write, 3 invalid input (an NDF that cannot be normalized), 4 device
+or build, 5 not supported, 7 a check failed, 130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_VERIFY)
+@click.argument("specs", metavar="[MODEL|FILE.clh...]", nargs=-1)
+@click.option("--precision", metavar="32|64", type=int, help="[default: both, where the device has float64]")
+@click.option("--plot", "folder", metavar="DIR", type=click.Path(path_type=Path),
+              help="Draw shapes, curves and error maps into this folder.")
+@click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
+@click.option("--quiet", is_flag=True, help="Print what failed only.")
+def verify(specs: tuple[str, ...], precision: int | None, folder: Path | None, device: str | None, as_json: bool,
+           quiet: bool) -> None:
+    """Check models against exact values, float64 references and what they declare of themselves.
+
+    All of the catalogue without a MODEL; else those named (ggx, ggx:alpha=.3, schlick:gold) and files of your own.
+    """
+    import time
+    from itertools import groupby
+
+    from whitefurnace import report, verification
+    from whitefurnace.device import choose_device
+    from whitefurnace.errors import CheckError, UsageError
+
+    start = time.perf_counter()
+    if precision not in (None, *verification.PRECISIONS):
+        raise UsageError(f"precision {precision} is not one of 32, 64")
+    subjects = verification.subjects(specs)
+    if folder is not None:
+        from whitefurnace import plots
+
+        plots.require()
+    on = choose_device(device)
+    both = verification.PRECISIONS if on.fp64 else (32,)
+    if precision is None and not on.fp64 and not quiet:
+        _say(f"notice: {on.identity()['name']} has no float64: float32 only")
+    rows: list[verification.Row] = []
+    with _progress(not (quiet or as_json)) as tell:
+        found = verification.verify(subjects, (precision,) if precision else both, on,
+                                    (lambda what, share: tell("verify", what, share)) if tell else None)
+        for _, group in groupby(found, key=lambda row: (row.slot, row.model)):
+            some = list(group)
+            rows += some
+            if as_json:
+                for row in report.verify_rows(some):
+                    _json(row)
+            elif shown := [row for row in some if not (quiet and row.passed)]:
+                if len(rows) == len(some):
+                    click.echo(report.VERIFY_HEAD)
+                click.echo(report.verify_text(shown))
+    if folder is not None:
+        for path in plots.draw(folder, [subject.model for subject in subjects], rows, on):
+            if as_json:
+                _json({"event": "plot", "file": str(path)})
+            elif not quiet:
+                click.echo(f"  wrote {path}")
+    if not (quiet or as_json):
+        click.echo(report.verify_summary(rows, time.perf_counter() - start, on.identity()["name"]))
+    failed = [row for row in rows if not row.passed]
+    if failed:
+        raise CheckError(f"{len(failed)} of {len(rows)} checks failed, the first: {failed[0].slot} {failed[0].model}, "
+                         f"{failed[0].check} in float{failed[0].precision}")
+
+
 @cli.command(epilog="\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 one works, 4 none does.")
 @click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout.")
 def devices(as_json: bool) -> None:
@@ -139,7 +299,8 @@ def models(name: str | None, as_json: bool) -> None:
         for row in report.model_rows(entries):
             _json(row)
     else:
-        click.echo(report.models_text(entries))
+        click.echo(report.models_text(entries) if name is None else
+                   "\n\n".join(report.model_text(entry) for entry in entries))
 
 
 def _json(row: dict[str, Any]) -> None:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,7 +15,7 @@ from whitefurnace.cells import CELLS_A_LAUNCH, over_nodes
 from whitefurnace.derived import Areas, numbers_of
 from whitefurnace.device import Device, choose_device
 from whitefurnace.errors import CheckError, UnsupportedError, UsageError, nearest
-from whitefurnace.recipe import Chosen, chosen
+from whitefurnace.recipe import Chosen, Spec, chosen
 
 DEFAULT_TOLERANCE = {32: 1e-6, 64: 1e-12}
 BACKFACING = ("clamp", "absolute")
@@ -25,6 +25,15 @@ ROUNDING = {32: 1e-6, 64: 2e-14}
 
 BLOCK = 64
 """Neighbouring cells that climb the ladder together. One cell alone could meet two rules that err alike."""
+
+LUCK = 5
+"""What a rule is taken to gain on the one before at most; fewer cells than a block that agree at once are taken to be
+lucky too. Without both, one lone cell in ten states an error too small in float64, by up to 30 times; whole blocks pay
+next to nothing for it."""
+
+UNFINISHED = 3
+"""Times its last change that the end of the ladder may be off where it did not converge: an error of first order in the
+nodes, as kinks leave it, falls by 1.4 a rule, and 1/1.4 + 1/1.4² + … is 2.5."""
 
 Progress = Callable[[float], None]
 
@@ -50,8 +59,8 @@ class Integrated:
         return np.array(self.values, dtype=dtype) if dtype or copy else self.values
 
 
-def integrate(name: str, *, ndf: str | Model | None = None, masking: str | Model = "smith",
-              fresnel: str | Model = "one", diffuse: str | Model | None = None, brdf: str | Model | None = None,
+def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
+              fresnel: Spec = "one", diffuse: Spec | None = None, brdf: Spec | None = None,
               precision: int = 32, tolerance: float | None = None, backfacing: str | None = None,
               device: Device | str | None = None, out: np.ndarray | None = None, progress: Progress | None = None,
               **parameters: Any) -> Integrated:
@@ -78,6 +87,7 @@ def integrate(name: str, *, ndf: str | Model | None = None, masking: str | Model
     if precision not in (32, 64):
         raise UsageError(f"precision {precision} is not one of 32, 64")
     entry = integral(name)
+    _refuse_lit(entry)
     if tolerance is None:
         tolerance = DEFAULT_TOLERANCE[precision]
     if not 0 < tolerance < 1:
@@ -101,7 +111,46 @@ def integrate(name: str, *, ndf: str | Model | None = None, masking: str | Model
         if progress:
             progress(end / grid.size)
     return Integrated(values, tally.error * len(parts), tally.evaluations, time.perf_counter() - start,
-                      tally.rule.name if tally.rule else "", tally.notices())
+                      tally.rule.name if tally.rule else "", (*tally.notices(), *_of_files(parts, flat)))
+
+
+def _of_files(parts: Sequence[_Part], flat: np.ndarray) -> Iterator[str]:
+    """What a user wants to hear of a model from a file: the norm that was divided out, or the range of its albedo."""
+    for part in parts:
+        for entry in part.slots.values():
+            low, high = part.norms
+            if entry.text is not None and entry.slot == "ndf":
+                some = f"{low:.4g}" if high - low <= 1e-4 * high else f"{low:.4g} to {high:.4g}"
+                yield f"{entry.path}: ∫ D(m)(n·m) dω = {some}" + (
+                    "" if part.entry.name == "normalization" else ", divided out")
+            elif entry.text is not None:
+                yield f"{entry.path}: albedo from {flat.min():.4g} to {flat.max():.4g}"
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What `integrate` would do with the same arguments: the models by slot, the shape of `values` and the digests
+    of the kernels. `precision`, `tolerance`, `device`, `out` and `progress` are no part of it."""
+
+    entry: Integral
+    slots: Mapping[str, Chosen]
+    shape: tuple[int, ...]
+    digests: tuple[str, ...]
+
+
+def demand(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
+           diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
+           **parameters: Any) -> Demand:
+    """The arguments of `integrate` checked, without a device. Raises what `integrate` raises of them."""
+    entry = integral(name)
+    _refuse_lit(entry)
+    slots = _slots(entry, ndf, masking, fresnel, diffuse, brdf)
+    shape = _grid(entry, slots, dict(parameters), backfacing).shape
+    digests = [_program(entry, some, 0).digest for some in _summands(slots)]
+    if "ndf" in slots and slots["ndf"].model.isotropic:
+        digests.append(source.area(slots["ndf"].model).digest)  # of the table, should it be needed
+    components = 3 if "brdf" in slots else entry.components
+    return Demand(entry, slots, shape if components == 1 else (*shape, components), tuple(digests))
 
 
 def _room(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.ndarray:
@@ -116,24 +165,29 @@ def _room(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.
 # ---------------------------------------------------------------------------------------------- what is asked
 
 
-def _slots(entry: Integral, ndf: str | Model | None, masking: str | Model, fresnel: str | Model,
-           diffuse: str | Model | None, brdf: str | Model | None) -> dict[str, Chosen]:
+def _refuse_lit(entry: Integral) -> None:
+    if entry.name == "radiance":
+        raise UsageError("integral radiance needs a light or an environment: whitefurnace.integrate takes them")
+
+
+def _slots(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
+           diffuse: Spec | None, brdf: Spec | None) -> dict[str, Chosen]:
     """The slots an integral needs, filled; a slot it does not need is not compiled in."""
-    albedo = entry.name in ("albedo", "albedo_average")
+    albedo = entry.name in ("albedo", "albedo_average", "radiance")
     if not albedo and (diffuse is not None or brdf is not None):
-        raise UnsupportedError(f"integral {entry.name} is of an NDF; a diffuse model or a BRDF has albedo and "
-                               "albedo_average")
+        raise UnsupportedError(f"integral {entry.name} is of an NDF; a diffuse model or a BRDF has albedo, "
+                               "albedo_average and radiance")
     if brdf is not None:
         if ndf is not None or diffuse is not None:
             raise UsageError("a brdf is whole: give it without an ndf and a diffuse model")
         return {"brdf": chosen("brdf", brdf)}
     slots: dict[str, Chosen] = {}
     if ndf is not None:
-        asked: dict[str, str | Model] = {"ndf": ndf, "masking": masking, "fresnel": fresnel}
+        asked: dict[str, Spec] = {"ndf": ndf, "masking": masking, "fresnel": fresnel}
         wanted = {need.split("_")[0].lower() for need in entry.needs}
         slots = {slot: chosen(slot, spec) for slot, spec in asked.items() if slot in wanted}
         provided = {f for choice in slots.values() for f in choice.model.provides}
-        missing = [f for f in entry.needs if f not in provided]
+        missing = [f for f in entry.needs if f not in provided and f.split("_")[0].lower() in slots]
         if missing:
             raise UnsupportedError(f"integral {entry.name}: {', '.join(c.model.name for c in slots.values())} "
                                    f"give no {', '.join(missing)}")
@@ -150,6 +204,7 @@ class _Grid:
 
     shape: tuple[int, ...]
     columns: Mapping[str, np.ndarray]
+    rgb: bool = False  # the last axis is that of the channels
 
     @property
     def size(self) -> int:
@@ -171,7 +226,8 @@ def _grid(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], b
     """Every number the kernels need, checked against its domain, and the broadcast shape."""
     columns: dict[str, Any] = {}
     rgb: set[str] = set()
-    isotropic = all(choice.model.isotropic for choice in slots.values()) and "brdf" not in slots
+    isotropic = (all(choice.model.isotropic for choice in slots.values()) and "brdf" not in slots
+                 and entry.name != "radiance")
     columns["NoV"] = np.ones(())
     columns["phi"] = np.zeros(())
     if entry.view:
@@ -212,7 +268,7 @@ def _grid(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], b
                          + ", ".join(f"{k} {np.shape(v)}" for k, v in columns.items() if np.ndim(v))) from None
     if 0 in shape:
         raise UsageError("parameters hold no cell: an array is empty")
-    return _Grid(shape, columns)
+    return _Grid(shape, columns, bool(rgb))
 
 
 def _number(name: str, given: Any) -> np.ndarray:
@@ -253,6 +309,7 @@ class _Part:
     slots: dict[str, Model]
     precision: int
     areas: dict[int, Areas] = field(default_factory=dict)
+    norms: tuple[float, float] = (np.inf, 0.0)
 
     @property
     def kind(self) -> str:
@@ -276,14 +333,17 @@ class _Part:
         needs = {f for m in self.slots.values() for f in m.needs}
         return "NDF_AREA" in needs and "NDF_AREA" not in self.slots["ndf"].provides
 
-    def cells(self, rows: np.ndarray, precision: int) -> tuple[np.ndarray, int, float]:
+    def cells(self, rows: np.ndarray, precision: int, tolerance: float = 0.0) -> tuple[np.ndarray, int, float]:
         """Rows of view and parameters -> rows as kernels read them, the length of the area's table, its error."""
         count = len(self.view)
         read, out, ndf = count, [rows[:count]], None
         for entry in self.slots.values():
             numbers = numbers_of(self.device, entry, rows[read:read + len(entry.parameters)])
-            if self.entry.name == "normalization" and entry.text is not None:
-                numbers[entry.arguments.index("per_norm")] = 1  # the raw norm is what is asked
+            if entry.slot == "ndf" and entry.text is not None:
+                at = entry.arguments.index("per_norm")
+                self.norms = (min(self.norms[0], 1 / numbers[at].max()), max(self.norms[1], 1 / numbers[at].min()))
+                if self.entry.name == "normalization":
+                    numbers[at] = 1  # the raw norm is what is asked
             ndf = numbers if entry.slot == "ndf" else ndf
             out.append(numbers)
             read += len(entry.parameters)
@@ -292,28 +352,42 @@ class _Part:
             assert ndf is not None
             if precision not in self.areas:
                 self.areas[precision] = Areas(self.device, self.slots["ndf"], precision)
-            table = self.areas[precision].table(ndf)
+            table = self.areas[precision].table(ndf, tolerance)
             out.append(table.rows)
             terms, error = table.length, table.error
         return np.concatenate(out), terms, error
 
+    @property
+    def ladder(self) -> tuple[Rule, ...]:
+        return LADDERS[self.kind]
+
+    def lanes(self, cells: np.ndarray) -> int:
+        """How many integrals the kernel sums for these cells."""
+        return cells.shape[1]
+
     def text(self, terms: int) -> str:
-        if "ndf" in self.slots:
-            return source.integration(integral("albedo") if self.entry.name == "albedo_average" else self.entry,
-                                      self.slots, terms).text
-        return source.hemisphere(next(iter(self.slots.values()))).text
+        return _program(self.entry, self.slots, terms).text
 
     def sum(self, cells: np.ndarray, terms: int, rule: Rule, precision: int) -> np.ndarray:
         return over_nodes(self.device, self.text(terms), "integrate", cells, self.components, precision, rule)
 
 
-def _parts(device: Device, entry: Integral, slots: Mapping[str, Chosen], precision: int) -> list[_Part]:
-    parts = []
+def _program(entry: Integral, slots: Mapping[str, Model], terms: int) -> source.Source:
+    """The kernel text of one summand of the BRDF."""
+    if "ndf" in slots:
+        return source.integration(integral("albedo") if entry.name == "albedo_average" else entry, slots, terms)
+    return source.hemisphere(next(iter(slots.values())))
+
+
+def _summands(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
+    """The models of each summand of the BRDF: the specular one, the diffuse one or a user's whole one."""
     specular = {slot: c.model for slot, c in slots.items() if slot in ("ndf", "masking", "fresnel")}
-    for some in (specular, *({slot: slots[slot].model} for slot in ("diffuse", "brdf") if slot in slots)):
-        if some:
-            parts.append(_Part(device, entry, some, precision))
-    return parts
+    return [some for some in (specular, *({slot: slots[slot].model} for slot in ("diffuse", "brdf") if slot in slots))
+            if some]
+
+
+def _parts(device: Device, entry: Integral, slots: Mapping[str, Chosen], precision: int) -> list[_Part]:
+    return [_Part(device, entry, some, precision) for some in _summands(slots)]
 
 
 @dataclass
@@ -335,34 +409,36 @@ class _Tally:
             if self.promoted else ()
 
 
+@np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
 def _climb(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally, precision: int | None = None) -> np.ndarray:
     """(components, n): climbs the ladder, every block of cells until two neighbouring rules agree on it."""
     precision = precision or part.precision
-    ladder = LADDERS[part.kind]
-    cells, terms, floor = part.cells(rows, precision)
+    ladder = part.ladder
+    cells, terms, floor = part.cells(rows, precision, tolerance)
     n = rows.shape[1]
     # A coarse tolerance starts low, a tight one where the tables of the rules say it can end.
     first = 0 if tolerance >= 1e-3 else 1 if tolerance >= 1e-5 else 3 if tolerance >= 1e-8 else 5
     values = part.sum(cells, terms, ladder[first], precision).astype(np.float64)
-    tally.used(ladder[first], n)
+    tally.used(ladder[first], part.lanes(cells))
     active = np.arange(n)
     change = np.empty(0)
-    allowed = np.empty(0)
+    slow = max(m.facts.get("slow rules", 1.0) for m in part.slots.values())
+    before = np.where(np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) < BLOCK, np.inf, 0.0)
     for rule in ladder[first + 1:]:
         fine = part.sum(cells[:, active], terms, rule, precision).astype(np.float64)
-        tally.used(rule, active.size)
+        tally.used(rule, part.lanes(cells[:, active]))
         starts = np.arange(0, active.size, BLOCK)
-        change = np.maximum.reduceat(np.abs(fine - values[:, active]).max(0), starts)
+        step = np.maximum.reduceat(np.abs(fine - values[:, active]).max(0), starts)
+        change, before = np.maximum(slow * step, before / LUCK), step
         size = np.maximum.reduceat(np.abs(fine).max(0), starts)
         values[:, active] = fine
         rounding = ROUNDING[precision] * size
         allowed = np.maximum(tolerance - rounding, rounding)
-        with np.errstate(invalid="ignore"):
-            open_ = ~(change <= allowed)
+        open_ = ~(change <= allowed)
         done = float(np.max((change + rounding + floor * size)[~open_], initial=0.0))
         tally.error = max(tally.error, done)
         keep = np.repeat(open_, BLOCK)[:active.size]
-        change, allowed, rounding = change[open_], allowed[open_], (rounding + floor * size)[open_]
+        change, before, rounding = change[open_], before[open_], (rounding + floor * size)[open_]
         active = active[keep]
         if active.size == 0:
             break
@@ -371,7 +447,7 @@ def _climb(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally, preci
         tally.promoted += active.size
         values[:, active] = _climb(part, rows[:, active], tolerance, tally, 64)
     elif active.size:
-        left = float(np.max(change + rounding))
+        left = float(np.max(max(UNFINISHED / slow, 1) * change + rounding))
         if not np.isfinite(left):
             raise CheckError(f"integral {part.entry.name} is not finite for some of these parameters in "
                              f"float{precision}{_example(part, rows, values)}")
@@ -418,7 +494,7 @@ def _slices(begin: int, end: int, step: int) -> Iterator[tuple[int, int]]:
         yield k, min(k + step, end)
 
 
-def dfg(size: int = 128, *, ndf: str | Model = "ggx", masking: str | Model = "smith",
+def dfg(size: int = 128, *, ndf: Spec = "ggx", masking: Spec = "smith",
         tolerance: float = 5e-6, precision: int = 32, device: Device | str | None = None) -> Integrated:
     """The split-sum table: `values` (size, size, 2), float32 or float64 by `precision`, as [y, x, (scale, bias)].
 
@@ -430,18 +506,21 @@ def dfg(size: int = 128, *, ndf: str | Model = "ggx", masking: str | Model = "sm
     axis = (np.arange(size) + 0.5) / size
     choice = chosen("ndf", ndf)
     rows: dict[str, Any] = rows_of_roughness(choice, axis[:, None])
-    return integrate("dfg", ndf=choice.model, masking=masking, tolerance=tolerance, precision=precision,
-                     device=device, NoV=axis[None, :], **rows)
+    return integrate("dfg", ndf=choice, masking=masking, tolerance=tolerance, precision=precision,
+                     device=device, NoV=np.broadcast_to(axis, (size, size)), **rows)
 
 
 def rows_of_roughness(choice: Chosen, r: np.ndarray) -> dict[str, np.ndarray]:
-    """The parameters of an NDF at perceptual roughnesses of any shape, those given with it held."""
-    if choice.model.from_roughness is None:
-        raise UnsupportedError(f"ndf {choice.model.name} has no parameter that follows roughness")
-    sets = [{**choice.model.from_roughness(float(x)), **choice.given} for x in r.ravel()]
+    """The parameters of a model that follow perceptual roughness, at roughnesses of any shape; those given with it
+    are held and not among them."""
+    entry = choice.model
+    if entry.from_roughness is None:
+        raise UnsupportedError(f"{entry.slot} {entry.name} has no parameter that follows roughness")
+    sets = [entry.from_roughness(float(x)) for x in r.ravel()]
     # A table's first row may fall below a domain by half a texel of roughness.
-    ends = {p.name: (p.low, p.high) for p in choice.model.parameters}
-    return {f"ndf_{name}": np.clip(np.array([s[name] for s in sets]).reshape(r.shape), *ends[name]) for name in sets[0]}
+    ends = {p.name: (p.low, p.high) for p in entry.parameters}
+    return {f"{entry.slot}_{name}": np.clip(np.array([s[name] for s in sets]).reshape(r.shape), *ends[name])
+            for name in sets[0] if name not in choice.given}
 
 
 __all__ = ["Integrated", "dfg", "integrate", "model"]

@@ -26,6 +26,9 @@ FUNCTIONS = {
     "FRESNEL_F": ("F", "s"),
     "DIFFUSE_F": ("f", "vv"),
     "BRDF_F": ("f", "vv"),
+    "LIGHT_L": ("L", "v"),
+    "LIGHT_C": ("C", "v"),
+    "SPECULAR_F": ("f", "vv"),  # of the slots ndf, masking and fresnel together: specular.clh
 }
 
 LOBE_WIDTH = 0.05
@@ -46,6 +49,20 @@ class Source:
 @cache
 def _file(name: str) -> str:
     return (resources.files("whitefurnace.kernels") / name).read_text("utf-8")
+
+
+@cache
+def everything() -> str:
+    """A digest of all kernel files, for programs that are put together as they are needed."""
+    digest, folders = hashlib.sha256(), [(resources.files("whitefurnace.kernels"), "")]
+    while folders:
+        folder, path = folders.pop()
+        for item in sorted(folder.iterdir(), key=lambda item: item.name):
+            if item.is_dir():
+                folders.append((item, f"{path}{item.name}/"))
+            elif item.name.endswith((".cl", ".clh")):
+                digest.update(f"{path}{item.name}\n".encode() + item.read_bytes())
+    return digest.hexdigest()
 
 
 def _assemble(parts: Sequence[str | tuple[str, str]]) -> Source:
@@ -103,7 +120,7 @@ def _bindings(slots: Mapping[str, Model], *, cells: Sequence[str] = ("NoV",), ar
             passed = dummies[:1] if function == "NDF_D" and not entry.takes_sin2 else dummies
             target, name = f"{slot}_{entry.name}_{ending}", function
             head = f"({', '.join(dummies)})" if dummies else ""
-            if slot in ("ndf", "diffuse", "brdf"):  # self-contained: its signature names its own numbers
+            if slot in ("ndf", "diffuse", "brdf", "light"):  # self-contained: its signature names its own numbers
                 call = f"{target}({', '.join([*passed, *(f'{slot}_{n}' for n in entry.passed(function))])})"
                 if function == "NDF_D":
                     # D is 0 for backfacing m, whatever the model, and a user's is divided by its norm: said once.
@@ -119,9 +136,10 @@ def _bindings(slots: Mapping[str, Model], *, cells: Sequence[str] = ("NoV",), ar
         lines.append("#define NDF_AREA(d) area_of_table(d, " + ", ".join(area) + ", ndf_area_terms)")
     if "ndf" in slots:
         if slots["ndf"].text is not None:
-            lines.append("#define NDF_WIDTH ndf_width")
+            lines.append("#define NDF_WIDTH ndf_lobe_width")
         if "NDF_REACH" not in bound:
-            lines.append("#define NDF_REACH ((real)HALF_PI)")
+            # Polar angle; stretched slope for anisotropic ones, where A has α/r beyond r for the longest tail.
+            lines.append(f"#define NDF_REACH ((real){'HALF_PI' if isotropic else '(PRECISION == 64 ? 1e14f : 1e7f)'})")
     if "masking" not in slots:
         lines.append("#define MASKING_AT(d) ((real)0)")
     rows = [*(f"cell_{name}" for name in cells), *(n for slot in slots for _, n in own[slot])]
@@ -184,10 +202,13 @@ def hemisphere(entry: Model) -> Source:
 def evaluation(function: str, slots: Mapping[str, Model], area_terms: int = 0) -> Source:
     """The program that evaluates `function` (`NDF_D`, `MASKING_V`, …) of `slots` at given arguments: `evaluate.cl`.
 
+    `SPECULAR_F` is the specular BRDF at (l, v), of the slots ndf, masking and fresnel.
+
     A cell holds the function's own arguments, three rows for a vector, then the models' numbers.
     """
     isotropic = "ndf" not in slots or slots["ndf"].isotropic
     rows, values = [], []
+    whole = function == "SPECULAR_F"
     for k, kind in enumerate(arguments(function, isotropic)):
         names = [f"{k}{axis}" for axis in ("xyz" if kind == "v" else ("",))]
         rows += names
@@ -199,7 +220,49 @@ def evaluation(function: str, slots: Mapping[str, Model], area_terms: int = 0) -
     else:
         result = f"STORE({call}, g, out);"
     return _assemble(["real.clh", ("bindings", _bindings(slots, cells=rows, area_terms=area_terms)),
-                      *_models(slots, area_terms), ("evaluate", f"#define EVALUATE {result}\n"), "evaluate.cl"])
+                      *_models(slots, area_terms), *(["specular.clh"] if whole else []),
+                      ("evaluate", f"#define EVALUATE {result}\n"), "evaluate.cl"])
+
+
+OUTLINE = ("Cx", "Cy", "Cz", "Ax", "Ay", "Az", "Bx", "By", "Bz", "length", "scale")
+"""A panel of an area light's outline as `radiance_outline.cl` reads it, after the view."""
+
+
+def _scatter(slots: Mapping[str, Model], components: int) -> str:
+    """`scatter`: adds w f(l, v) of the slots, all together, to one sum or to one for each channel."""
+    terms = [term for slot, term in (("ndf", "SPECULAR_F(l, v)"), ("diffuse", "DIFFUSE_F(l, v)")) if slot in slots]
+    if "brdf" in slots:
+        body = "const real3 f = BRDF_F(l, v); sum[0] += w * f.x; sum[1] += w * f.y; sum[2] += w * f.z;"
+    else:
+        body = f"const real f = w * ({' + '.join(terms)}); " + " ".join(f"sum[{c}] += f;" for c in range(components))
+    return f"static inline void scatter(real *sum, real w, real3 l, real3 v CELL_PARAMETERS) {{ {body} }}\n"
+
+
+def outline(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
+    """The program of reflected radiance over the outline of an area light, of one summand of the BRDF."""
+    specular = "ndf" in slots
+    kind = "" if specular else "#define SMOOTH\n" if "diffuse" in slots else "#define WHOLE\n"
+    components = 3 if "brdf" in slots else 1
+    defines = (f"{kind}#define COMPONENTS {components}\n#define LOBE_WIDTH ((scalar){LOBE_WIDTH!r})\n"
+               f"#define LEAST_COSINE ((scalar){LEAST_COSINE!r})\n")
+    return _assemble(["real.clh", ("bindings", defines + _bindings(slots, cells=("NoV", "phi", *OUTLINE),
+                                                                   area_terms=area_terms)),
+                      *_models(slots, area_terms),
+                      "facet.clh" if specular else ("scatter", _scatter(slots, components)), "radiance_outline.cl"])
+
+
+def lit_nodes(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
+    """The program of reflected radiance over a list of an environment's nodes, of the whole BRDF."""
+    defines = f"#define LEAST_COSINE ((scalar){LEAST_COSINE!r})\n"
+    return _assemble(["real.clh", ("bindings", defines + _bindings(slots, cells=("NoV", "phi"),
+                                                                   area_terms=area_terms)),
+                      *_models(slots, area_terms), *(["specular.clh"] if "ndf" in slots else []),
+                      ("scatter", _scatter(slots, 3)), "radiance_nodes.cl"])
+
+
+def frame_nodes(kind: str) -> Source:
+    """Nodes of a source of the kind "latlong" or "cube" in the frame of a surface."""
+    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", "radiance_texels.cl"])
 
 
 def convolution(ndf: Model | None) -> Source:

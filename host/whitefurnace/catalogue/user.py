@@ -13,6 +13,10 @@ FORMS = {
 }
 
 
+CONSTANTS = ("per_norm", "lobe_width")
+"""What the engine finds out about a user's D; its own parameters cannot have these names."""
+
+
 def user_model(slot: str, path: str | Path) -> Model:
     """The model of `path` for the slot `ndf` or `brdf`; its parameters are those its signature names.
 
@@ -50,6 +54,11 @@ def user_model(slot: str, path: str | Path) -> Model:
     rest = signature[count:]
     if [kind for kind, _ in signature[:len(own)]] != [kind for kind, _ in own] or any(k != "real" for k, _ in rest):
         raise InputError(f"{path}: {name} takes ({found[1].strip()}); needed is {wanted}")
+    names = [name for _, name in rest]
+    for name in names:
+        if name in CONSTANTS or names.count(name) > 1 or name in ("area_scale", "area_per_range", "area_grazing",
+                                                                  "area_terms"):
+            raise InputError(f"{path}: parameter {name!r} of the function is taken; give it another name")
     return Model(
         slot=slot,
         name=path.stem,
@@ -59,7 +68,7 @@ def user_model(slot: str, path: str | Path) -> Model:
         provides=("NDF_D",) if slot == "ndf" else ("BRDF_F",),
         reference={},
         from_roughness=(lambda r: {"alpha": r * r}) if any(p == "alpha" for _, p in rest) else None,
-        constant_names=("per_norm", "width") if slot == "ndf" else (),
+        constant_names=CONSTANTS if slot == "ndf" else (),
         text=text,
         path=str(path),
         takes_sin2=takes_sin2,

@@ -5,6 +5,7 @@ from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
 from whitefurnace.files.exr import write_exr
 from whitefurnace.files.image import Image, decode_srgb, read_image
 from whitefurnace.files.manifest import read_manifest, write_manifest
+from whitefurnace.files.npy import release, scratch, write_npy
 from whitefurnace.files.npz import write_npz
 
 __all__ = [
@@ -14,8 +15,11 @@ __all__ = [
     "digest_file",
     "read_image",
     "read_manifest",
+    "release",
+    "scratch",
     "write_atomic",
     "write_exr",
     "write_manifest",
+    "write_npy",
     "write_npz",
 ]

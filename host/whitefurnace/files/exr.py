@@ -12,6 +12,9 @@ import numpy.typing as npt
 from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction, write_atomic
 
+ROWS_AT_ONCE = 1 << 24
+"""Bytes of rows that are handed over at once."""
+
 
 def write_exr(
     path: str | os.PathLike[str],
@@ -73,7 +76,11 @@ def _write(
     output = oiio.ImageOutput.create("openexr")
     if output is None:
         return _first_line(oiio.geterror())
-    done = output.open(str(path), spec) and output.write_image(pixels)
+    done = output.open(str(path), spec)
+    # A whole number of ZIP's 16 rows at a time: in one go OpenImageIO takes several times the image's memory.
+    step = 16 * max(ROWS_AT_ONCE // (64 * width * channels), 1)
+    for y in range(0, height, step):
+        done = done and output.write_scanlines(y, min(y + step, height), 0, pixels[y : y + step])
     complaint = output.geterror()
     closed = output.close()
     complaint = complaint or output.geterror()
@@ -89,16 +96,23 @@ def _holds(path: Path, pixels: npt.NDArray[np.float32]) -> bool:
     if source is None:
         oiio.geterror()
         return False
-    back = source.read_image(0, 0, 0, pixels.shape[2], "float")
-    failed = source.has_error
-    source.geterror()
-    source.close()
-    if back is None or failed:
-        return False
-    back = np.ascontiguousarray(back, np.float32)
-    return back.size == pixels.size and bool(
-        np.array_equal(back.view(np.uint32).ravel(), pixels.view(np.uint32).ravel())
-    )
+    height, width, channels = pixels.shape
+    try:
+        if (source.spec().height, source.spec().width, source.spec().nchannels) != pixels.shape:
+            return False
+        step = max(ROWS_AT_ONCE // (4 * width * channels), 1)
+        for y in range(0, height, step):
+            end = min(y + step, height)
+            back = source.read_scanlines(y, end, 0, 0, channels, "float")
+            if back is None or source.has_error:
+                return False
+            back = np.ascontiguousarray(back, np.float32)
+            if not np.array_equal(back.view(np.uint32).ravel(), pixels[y:end].view(np.uint32).ravel()):
+                return False
+        return True
+    finally:
+        source.geterror()
+        source.close()
 
 
 def _first_line(complaint: str) -> str:

@@ -26,5 +26,6 @@ ENTRY = Model(
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
-    facts={"reciprocal": True, "follows roughness": False},
+    # Kinks where the grooves begin to mask: a rule errs by up to this many times its change from the one before.
+    facts={"reciprocal": True, "follows roughness": False, "slow rules": 32.0},
 )

@@ -20,5 +20,6 @@ ENTRY = Model(
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
-    facts={"reciprocal": True, "follows roughness": False},
+    # A peak of 1/(v·h)² where both graze: a rule errs by up to this many times its change from the one before.
+    facts={"reciprocal": True, "follows roughness": False, "slow rules": 8.0},
 )

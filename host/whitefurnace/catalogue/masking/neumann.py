@@ -22,5 +22,6 @@ ENTRY = Model(
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
-    facts={"reciprocal": True, "follows roughness": False},
+    # A kink at n·l = n·v: a rule errs by up to this many times its change from the one before.
+    facts={"reciprocal": True, "follows roughness": False, "slow rules": 16.0},
 )

@@ -44,8 +44,6 @@ ENTRY = Model(
         "projected area": "closed",
         "tail": "D falls like 1/sin⁴θ",
         "float32": "relative error of D at most 8.5e-7",
-        # Sums of four panels in float32 leave this much at grazing views of α = 1e-4.
-        "tolerance": {"weak furnace": (2e-6, 1e-12)},
         "limits": "uniform at α = 1",
     },
 )
