@@ -164,11 +164,11 @@ def double_exponential(step: float = 1 / 12, reach: float = 3.2) -> tuple[np.nda
     return x, rest, 2 * np.sqrt(y * y + (math.pi / 2) ** 2) * x * rest * step
 
 
-def smith_area(D: Callable[[np.ndarray], np.ndarray], below: np.ndarray, step: float = 1 / 12) -> np.ndarray:
-    """A(v) = ∫ D (v·m)₊ dω at views `below` radians above the horizon, of a D(θ), in θ_m with the azimuth in closed form:
+def smith_area(D: Callable[[np.ndarray], np.ndarray], up: np.ndarray, step: float = 1 / 12) -> np.ndarray:
+    """A(v) = ∫ D (v·m)₊ dω of a D(θ) at views `up` radians above the horizon, in θ_m with the azimuth in closed form:
     ∫ (v·m)₊ dφ = 2 (cos θv cos θm φ1 + sin θv sin θm sin φ1), cos φ1 = -cot θv cot θm."""
     x, rest, w = double_exponential(step)
-    up = np.asarray(below, np.float64)[:, None]
+    up = np.asarray(up, np.float64)[:, None]
     c, s = np.sin(up), np.cos(up)
     total = np.zeros(up.shape[0])
     for start, length, whole in ((0.0, up, True), (up, math.pi / 2 - up, False)):

@@ -134,7 +134,7 @@ def test_projected_area_against_quadrature(device: Device, name: str, precision:
     # Tanh-sinh at this step holds lobes of 1e-5 rad to 1e-9 (against half of the step).
     # Thin rims of sheen cost float32 a few roundings more, which must be stated.
     assert_close(got.values, want, max(exact(name, precision), got.error, 1e-9), columns, name)
-    assert got.error <= (1e-5 if precision == 32 else 1e-11)
+    assert got.error <= (2e-6 if precision == 32 else 1e-11) * max(want.max(), 1)
 
 
 @pytest.mark.parametrize("masking", [n for n, m in MASKINGS.items() if "MASKING_G1" in m.provides and n not in FURNACE])
@@ -435,10 +435,10 @@ def test_a_scaled_ndf_is_the_ndf(device: Device, files: Any) -> None:
     assert np.abs(norm.values - 7).max() <= 7e-6
     columns = product({"NoV": NOV, "alpha": alpha})
     for integral in ("projected_area", "weak_furnace", "albedo", "dfg"):
-        for masking in ("smith", "smith_separable", "neumann") if integral in ("albedo", "dfg") else ("smith",):
+        for masking in ("smith", "implicit") if integral in ("albedo", "dfg") else ("smith",):
             a, b = (integrate(integral, ndf=ndf, masking=masking, device=device, **columns) for ndf in (mine, "ggx"))
             assert_close(a.values, b.values, a.error + b.error, _like(columns, a.values), (integral, masking))
-            assert max(a.error, b.error) <= (1e-5 if masking != "neumann" else 1e-3)
+            assert max(a.error, b.error) <= 1e-5
     averages = [integrate("albedo_average", ndf=ndf, alpha=alpha, device=device) for ndf in (mine, "ggx")]
     assert np.abs(averages[0].values - averages[1].values).max() <= averages[0].error + averages[1].error
 

@@ -428,8 +428,8 @@ def _climb(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally, preci
         fine = part.sum(cells[:, active], terms, rule, precision).astype(np.float64)
         tally.used(rule, part.lanes(cells[:, active]))
         starts = np.arange(0, active.size, BLOCK)
-        step = np.maximum.reduceat(np.abs(fine - values[:, active]).max(0), starts)
-        change, before = np.maximum(slow * step, before / LUCK), step
+        step = slow * np.maximum.reduceat(np.abs(fine - values[:, active]).max(0), starts)
+        change, before = np.maximum(step, before / LUCK), step
         size = np.maximum.reduceat(np.abs(fine).max(0), starts)
         values[:, active] = fine
         rounding = ROUNDING[precision] * size

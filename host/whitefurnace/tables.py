@@ -104,8 +104,8 @@ def _count(count: int, where: str = "") -> int:
 
 def _sizes(size: int | str | Sequence[int]) -> tuple[int, int, bool]:
     """(N, M, whether both were given) of `N`, `NxM` or a pair."""
-    parts = size.lower().replace("×", "x").split("x") if isinstance(size, str) else size
-    items = list(parts) if isinstance(parts, Sequence) else [parts]
+    items: list[Any] = size.lower().replace("×", "x").split("x") if isinstance(size, str) else \
+        list(size) if isinstance(size, Sequence) else [size]
     try:
         counts = [_count(int(item)) for item in items]
     except (TypeError, ValueError):
@@ -332,7 +332,7 @@ def lut(kind: str, path: str | os.PathLike[str], *, device: Device | str | None 
     roughness r = (y + ½)/M, row 0 smoothest, which the models' own parameters follow; without a view r alone is x. A
     parameter that is given stays put; an axis of the same name replaces a default one, others come after it, slower,
     in their order. More than two want .npy. What exists with the same key is skipped, what the manifest proves ours
-    replaced, and anything else needs `force`. Raises UsageError, UnsupportedError, FileError, CheckError and DeviceError.
+    replaced, and anything else needs `force`. Raises UsageError, UnsupportedError, FileError, CheckError, DeviceError.
     """
     return make(order(kind, path, **options), device, dry_run=dry_run, progress=progress)
 
@@ -366,9 +366,9 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
             if progress:
                 progress(request.path.name, "cells", share)
 
-        result = integrate(request.kind, **request.models, **request.lit, backfacing=request.backfacing, device=on,
-                           precision=request.precision, tolerance=request.tolerance, out=out, progress=tell,
-                           **request.columns)  # type: ignore[arg-type]
+        what: dict[str, Any] = {**request.models, **request.lit, **request.columns}
+        result = integrate(request.kind, backfacing=request.backfacing, device=on, precision=request.precision,
+                           tolerance=request.tolerance, out=out, progress=tell, **what)
         made.append(replace(result, values=np.empty(0)))  # the file has them; what is held would keep it mapped
 
     with Transaction() as transaction:

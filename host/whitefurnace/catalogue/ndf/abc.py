@@ -66,6 +66,8 @@ ENTRY = Model(
         "tail": "D falls like (1 - cos θ)^-c",
         "float32": "relative error of D at most 3.5e-6 where D > 1e-7 of its peak; 2.5e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-38 of it",
+        "quadrature": "normalization within 3e-7 and 9e-15, weak furnace with Smith within 1e-6 and 2e-13 "
+                      "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "uniform at b = 0 or c = 0; the norm is regular at c = 1 and c = 2",
     },
 )

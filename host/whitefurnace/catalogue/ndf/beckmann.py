@@ -42,6 +42,8 @@ ENTRY = Model(
         "tail": "D falls like exp(-tan²θ/α²)",
         "float32": "relative error of D at most 5.5e-6 where D > 1e-7 of its peak; 6e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-34 of it",
+        "quadrature": "normalization within 3e-7 and 3e-15, weak furnace with Smith within 1e-6 and 2e-14 "
+                      "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "D is 0 at grazing for every α",
     },
 )

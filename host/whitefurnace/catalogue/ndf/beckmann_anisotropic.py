@@ -45,6 +45,8 @@ ENTRY = Model(
         "tail": "D falls like exp(-tan²θ/α²)",
         "float32": "relative error of D at most 8e-6 where D > 1e-7 of its peak; 7e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-34 of it",
+        "quadrature": "normalization within 4e-7 and 5e-15, weak furnace with Smith within 1e-6 and 2e-13 "
+                      "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "D is 0 at grazing for every α",
     },
 )

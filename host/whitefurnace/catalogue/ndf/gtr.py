@@ -56,6 +56,8 @@ ENTRY = Model(
         "tail": "D falls like sin^-2γ θ",
         "float32": "relative error of D at most 3e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-38 of it",
+        "quadrature": "normalization within 4e-7 and 7e-15, weak furnace with Smith within 1e-6 and 2e-13 "
+                      "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "GGX at γ = 2; uniform at γ = 0 or α = 1; the norm is regular at γ = 1",
     },
 )
