@@ -519,6 +519,11 @@ def test_bad_input_is_one_sentence(radiance: Any, arguments: dict[str, Any], sai
         radiance(NoV=0.5, alpha=0.3, **arguments)
 
 
+def test_out_must_hold_fractions(radiance: Any) -> None:
+    with pytest.raises(UsageError, match="out is int32 of shape"):
+        radiance(light="ambient", ndf="ggx", NoV=[0.2, 0.5], alpha=0.3, out=np.empty(2, np.int32))
+
+
 def test_what_cannot_be_is_refused(radiance: Any, device: Device) -> None:
     with pytest.raises(UnsupportedError, match="reflects no punctual light"):
         radiance(light="punctual", NoV=0.5, NoL=0.5)

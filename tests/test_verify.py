@@ -34,6 +34,10 @@ FILES = {
             "  return vec3(f, f, f);\n}\n",
     "minus": "real3 brdf_minus_f(real3 l, real3 v) {\n  real f = (dot3(l, v) - (real)0.5f) / 10;\n"
              "  return vec3(f, f, f);\n}\n",
+    # NaN between the angles at which a D is looked at first.
+    "gap": "real ndf_gap_D(real cos_m, real sin2_m) {\n"
+           "  return sqrt((sin2_m - (real)0.251f) * (sin2_m - (real)0.25f));\n}\n",
+    "top": "real ndf_top_D(real cos_m) { return (1 - cos_m) / (1 - cos_m); }\n",
     "neither": "real3 something_f(real3 l, real3 v) { return l; }\n",
 }
 
@@ -243,10 +247,20 @@ def test_a_broken_brdf(device: Device, files: Path, stem: str, check: str) -> No
 
 @pytest.mark.parametrize("stem, kind, words", [("steep", InputError, "cannot be normalized"),
                                                ("dips", InputError, "negative"),
-                                               ("tail", UnsupportedError, "infinite")])
+                                               ("top", InputError, "not finite at θ = 0 rad"),
+                                               ("tail", UnsupportedError, "masking: its projected area is infinite")])
 def test_an_ndf_that_is_refused(device: Device, files: Path, stem: str, kind: type[Exception], words: str) -> None:
     with pytest.raises(kind, match=words):
         list(verify(subjects([f"{files}/{stem}.clh"]), [32], device))
+
+
+def test_what_is_not_a_number_fails(device: Device, files: Path) -> None:
+    rows = []
+    with pytest.raises(InputError, match=r"not finite at θ = 0\.52"):  # as the sampler finds
+        for row in verify(subjects([f"{files}/gap.clh"]), [32], device):
+            rows.append(row)
+    bad = failed(rows)
+    assert "raw norm" in bad and all(row.counterexample is not None and "nan" in told(row) for row in bad.values())
 
 
 def test_specs(files: Path, tmp_path: Path) -> None:
@@ -261,6 +275,16 @@ def test_specs(files: Path, tmp_path: Path) -> None:
         subjects([f"{files}/neither.clh"])
     with pytest.raises(FileError, match="cannot be read"):
         subjects([str(tmp_path / "none.clh")])
+    with pytest.raises(UsageError, match="masking implicit has no parameter 'k'; there is none$"):
+        subjects(["implicit:k=1"])
+    odd = tmp_path / "my.clh files" / "one.clh.d"
+    odd.mkdir(parents=True)
+    (odd / "white.clh").write_text(FILES["white"], "utf-8")
+    assert subjects([f"{odd}/white.clh:albedo=1"])[0].label == str(odd / "white.clh")
+    (odd / "two words.clh").write_text(FILES["white"], "utf-8")
+    with pytest.raises(InputError) as refused:
+        subjects([f"{odd}/two words.clh"])
+    assert str(refused.value).count("C identifier") == 1  # once, though it is no NDF and no BRDF
 
 
 # ---------------------------------------------------------------------------------------------- the command

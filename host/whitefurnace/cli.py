@@ -176,7 +176,8 @@ def _named(option: str, given: tuple[str, ...]) -> dict[str, str]:
     for item in given:
         name, equals, value = item.partition("=")
         if not (name.isidentifier() and equals and value) or name in found:
-            raise UsageError(f"{option} {item!r}: {name or 'a name'} must be given once, as NAME=VALUE")
+            form = "NAME=A:B:N[:SCALE]" if option == "--axis" else "NAME=VALUE"
+            raise UsageError(f"{option} {item!r}: {name or 'a name'} must be given once, as {form}")
         found[name] = value
     return found
 
@@ -360,7 +361,12 @@ def main(argv: list[str] | None = None) -> None:
         code = 1
     except (click.Abort, KeyboardInterrupt):
         _say("interrupted: nothing half-written was left")
-        code = 130
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError):
+                stream.flush()
+        # Not sys.exit: an interrupt inside an exec, as of a dataclass at import, marks the process, and Python then ends it
+        # by the signal whatever is asked.
+        os._exit(130)
     except BrokenPipeError:  # the reader of stdout went away; what it did not read cannot be flushed either
         _abandon_stdout()
         code = 2

@@ -73,17 +73,18 @@ def finest(device: Device) -> int:
 def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.ndarray:
     """(2, n): 1/norm of a user's D and the angle that holds half of its energy."""
     precision = finest(device)
-    theta = np.concatenate([np.geomspace(1e-6, math.pi / 4, 600), math.pi / 2 - np.geomspace(math.pi / 4, 1e-6, 400)])
+    theta = np.concatenate([[0.0], np.geomspace(1e-6, math.pi / 4, 600),
+                            math.pi / 2 - np.geomspace(math.pi / 4, 1e-6, 400)])
     ones = np.ones((2, 1))
     widths = np.empty(distinct.shape[1])
     for k in range(distinct.shape[1]):
         own = np.repeat(np.concatenate([distinct[:, k:k + 1], ones]), theta.size, 1)
         cells = np.concatenate([np.stack([np.cos(theta), np.sin(theta) ** 2]), own])
         D = evaluate(device, "NDF_D", {"ndf": entry}, cells, precision)[0].astype(np.float64)
-        _refuse_bad(entry, D, theta)
+        refuse_bad(entry, D, theta)
         energy = np.concatenate([[0.0], np.cumsum(np.diff(theta) * (D * np.sin(2 * theta))[1:])])
         if energy[-1] <= 0:
-            raise InputError(f"{entry.path}: cannot be normalized: it is 0 everywhere")
+            raise InputError(f"{entry.path}: cannot be normalized: D is 0 everywhere from θ = {theta[1]:g} rad on")
         widths[k] = np.interp(0.5 * energy[-1], energy, theta)
     cells = np.concatenate([np.ones((1, distinct.shape[1])), distinct, np.ones((1, distinct.shape[1])), widths[None]])
     program = source.integration(integral("normalization"), {"ndf": entry}).text
@@ -97,7 +98,7 @@ def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.nd
     return np.stack([1 / fine, widths])
 
 
-def _refuse_bad(entry: Model, D: np.ndarray, theta: np.ndarray) -> None:
+def refuse_bad(entry: Model, D: np.ndarray, theta: np.ndarray) -> None:
     """InputError for a D that is NaN, infinite or negative somewhere."""
     for bad, what in ((~np.isfinite(D), "not finite"), (D < 0, "negative")):
         if bad.any():
@@ -148,9 +149,11 @@ class Areas:
         if not (np.abs(zero - coarse) <= CONVERGED * zero).all():
             worst = distinct[:, np.abs(zero / coarse - 1).argmax()]
             where = dict(zip(self.entry.arguments, worst.tolist(), strict=True))
-            own = {p.name: where[p.name] for p in self.entry.parameters}
-            raise UnsupportedError(f"ndf {self.entry.name} has no Smith masking for {own}: its projected area is "
-                                   "infinite, since D grows like 1/cos θ at grazing or faster")
+            own = ", ".join(f"{p.name} = {where[p.name]:g}" for p in self.entry.parameters)
+            why = "infinite, since D grows like 1/cos θ at grazing or faster" if not np.isnan(zero + coarse).any() else \
+                "not a number, since D is not one somewhere"
+            raise UnsupportedError(f"ndf {self.entry.name} has no Smith masking{' for ' if own else ''}{own}: its "
+                                   f"projected area is {why}")
         scale = np.maximum(np.minimum(zero, width), 1e-7)
         angle = (np.arange(count) + 0.5) * math.pi / count
         q = (1 - np.cos(angle)) / 2

@@ -55,8 +55,10 @@ class PartialError(WhitefurnaceError):
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:
-    """`; did you mean 'x'?` for the choice closest to `name`, or the list of choices."""
+    """`; did you mean 'x'?` for the choice closest to `name`, or the list of choices, if there is any."""
     choices = list(choices)
+    if not choices:
+        return "; there is none"
     close = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
     if close:
         return f"; did you mean {close[0]!r}?"

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -34,6 +35,12 @@ class Chosen:
 Spec = str | Model | Chosen
 
 
+def file_of(spec: str) -> str | None:
+    """The path of `FILE.clh[:p=v,…]`, whose folders may have any name; None for what is no file."""
+    found = re.match(r"(.*\.clh)(?::|$)", spec, re.DOTALL)
+    return found[1] if found else None
+
+
 def chosen(slot: str, spec: Spec) -> Chosen:
     """A model from `NAME`, `NAME:PRESET`, `NAME:p=v,…`, `FILE.clh[:p=v,…]`, a catalogue entry or what was chosen.
 
@@ -44,9 +51,9 @@ def chosen(slot: str, spec: Spec) -> Chosen:
         return spec
     if isinstance(spec, Model):
         return Chosen(spec, {})
-    file, suffix, rest = spec.partition(".clh")
-    if suffix and (not rest or rest[0] == ":"):
-        entry, rest = user_model(slot, file + suffix), rest[1:]
+    file = file_of(spec)
+    if file is not None:
+        entry, rest = user_model(slot, file), spec[len(file) + 1:]
     else:
         name, _, rest = spec.partition(":")
         entry = model(slot, name)

@@ -157,8 +157,8 @@ def _room(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.
     """The array for the values: `out`, or a new one."""
     if out is None:
         return np.empty(shape, np.dtype(f"f{precision // 8}"))
-    if out.shape != shape or not out.flags.c_contiguous:
-        raise UsageError(f"out has shape {out.shape}; needed is a contiguous array of {shape}")
+    if out.shape != shape or not out.flags.c_contiguous or out.dtype.kind != "f":
+        raise UsageError(f"out is {out.dtype} of shape {out.shape}; needed is a contiguous array of floats, {shape}")
     return out
 
 
@@ -290,9 +290,10 @@ def _view(given: Any, backfacing: str | None) -> np.ndarray:
         NoV = np.where((NoV < 0) & (NoV >= -1), 0.0, NoV)
     elif backfacing == "absolute":
         NoV = np.abs(NoV)
-    if not ((NoV >= 0) & (NoV <= 1)).all():
+    bad = ~((NoV >= 0) & (NoV <= 1))
+    if bad.any():
         behind = (NoV < 0).any() and backfacing is None
-        raise UsageError("NoV is outside [0, 1] (cosine of the view angle)"
+        raise UsageError(f"NoV = {NoV[bad].flat[0]:g} is outside [0, 1] (cosine of the view angle)"
                          + ("; views from behind want backfacing = clamp or absolute" if behind else ""))
     return NoV
 

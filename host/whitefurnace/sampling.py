@@ -8,7 +8,7 @@ import numpy as np
 
 from whitefurnace.catalogue import Model
 from whitefurnace.cells import evaluate
-from whitefurnace.derived import finest, numbers_of
+from whitefurnace.derived import finest, numbers_of, refuse_bad
 from whitefurnace.device import Device, choose_device
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.recipe import chosen
@@ -81,6 +81,8 @@ def _energy(device: Device, entry: Model, numbers: np.ndarray) -> tuple[np.ndarr
     cells = np.concatenate([np.stack([np.cos(theta), np.sin(theta) ** 2]).reshape(2, -1),
                             np.repeat(numbers, theta.size, 1)])
     D = evaluate(device, "NDF_D", {"ndf": entry}, cells, precision)[0].astype(np.float64).reshape(theta.shape)
+    if entry.text is not None:
+        refuse_bad(entry, D.ravel(), theta.ravel())
     parts = (w * D * np.cos(theta) * np.sin(theta) * np.cosh(t)).sum(1)
     energy = np.concatenate([[0.0], np.cumsum(parts)])
     return energy / energy[-1], np.minimum(width * np.sinh(edges), math.pi / 2)

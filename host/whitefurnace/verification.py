@@ -19,7 +19,7 @@ from whitefurnace.derived import numbers_of
 from whitefurnace.device import Device
 from whitefurnace.errors import CheckError, InputError, UnsupportedError, UsageError, nearest
 from whitefurnace.radiance import radiance
-from whitefurnace.recipe import chosen
+from whitefurnace.recipe import chosen, file_of
 from whitefurnace.run import integrate
 from whitefurnace.sampling import sample
 from whitefurnace.source import LEAST_COSINE
@@ -104,10 +104,9 @@ def subjects(specs: Sequence[str]) -> list[Subject]:
         return [Subject(entry, entry.name) for entry in entries]
     found = []
     for spec in specs:
-        file, suffix, rest = spec.partition(".clh")
-        name = spec.partition(":")[0]
-        if suffix and (not rest or rest[0] == ":"):
-            found += [_of_file(slot, file + suffix, spec) for slot in _slots_of(file + suffix)]
+        file, name = file_of(spec), spec.partition(":")[0]
+        if file is not None:
+            found += [_of_file(slot, file, spec) for slot in _slots_of(file)]
             continue
         slots = [entry.slot for entry in entries if entry.name == name]
         if not slots:
@@ -128,7 +127,7 @@ def _slots_of(path: str) -> list[str]:
         except InputError as error:
             reasons.append(str(error))
     if not defined:
-        raise InputError("; ".join(reasons))
+        raise InputError("; ".join(dict.fromkeys(reasons)))  # what is wrong with both is said once
     return defined
 
 
@@ -284,12 +283,14 @@ class Bench:
                    note, None if passed else own)
 
     def measured(self, check: str, value: Any, where: Mapping[str, Any], least: bool = False, note: str = "") -> Row:
-        """What is told and not judged: the largest value, or the least."""
+        """What is told and not judged: the largest value, or the least. Where all are NaN there is nothing to tell, and
+        the check fails."""
         flat = np.asarray(value, np.float64).ravel()
-        k = int(np.nanargmin(flat) if least else np.nanargmax(flat))
+        known = not np.isnan(flat).all()
+        k = int(np.nanargmin(flat) if least else np.nanargmax(flat)) if known else 0
         own = {n: float(np.broadcast_to(c, np.shape(value)).ravel()[k]) for n, c in where.items()}
         return Row(self.model.slot, self.subject.label, check, own, self.precision, float(flat[k]), None, None, None,
-                   True, flat.size, note)
+                   known, flat.size, note, None if known else own)
 
 
 def _product(*axes: Any, columns: Columns) -> tuple[list[np.ndarray], Columns]:
