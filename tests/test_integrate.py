@@ -759,3 +759,17 @@ def test_separable_smith_against_mitsuba(device: Device, alpha: float, NoV: floa
     assert abs(float(got.values) - mitsuba_albedo(mitsuba, alpha, NoV)) <= 3e-5
 
 
+
+
+def test_an_albedo_that_is_infinite_is_said_to_be(device: Device) -> None:
+    # E = albedo · NoV^(k - 1) [Minnaert1941]: at NoV = 0 infinite for k < 1, albedo for k = 1, 0 above.
+    got = integrate("albedo", diffuse="minnaert", albedo=0.5, exponent=[0.5, 1.0, 2.0], NoV=0.0, device=device)
+    assert got.values[0] == np.inf and np.abs(got.values[1:] - [0.5, 0.0]).max() < 2e-6  # the default 1e-6, rounding
+    assert got.error < 2e-6 and got.notices == ()
+
+
+def test_a_missed_tolerance_is_said(device: Device) -> None:
+    missed = integrate("albedo", ndf="ggx", masking="cook_torrance", alpha=0.3, NoV=0.5, device=device)
+    assert missed.error > 2e-6 and any("over the tolerance" in notice for notice in missed.notices)
+    met = integrate("albedo", ndf="ggx", alpha=0.3, NoV=0.5, device=device)
+    assert not any("tolerance" in notice for notice in met.notices)

@@ -275,7 +275,7 @@ def test_specs(files: Path, tmp_path: Path) -> None:
         subjects([f"{files}/neither.clh"])
     with pytest.raises(FileError, match="cannot be read"):
         subjects([str(tmp_path / "none.clh")])
-    with pytest.raises(UsageError, match="masking implicit has no parameter 'k'; there is none$"):
+    with pytest.raises(UsageError, match="masking implicit has no parameter 'k'; there is none"):
         subjects(["implicit:k=1"])
     odd = tmp_path / "my.clh files" / "one.clh.d"
     odd.mkdir(parents=True)

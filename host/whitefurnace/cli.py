@@ -219,7 +219,7 @@ def verify(specs: tuple[str, ...], precision: int | None, folder: Path | None, d
 
     from whitefurnace import report, verification
     from whitefurnace.device import choose_device
-    from whitefurnace.errors import CheckError, UsageError
+    from whitefurnace.errors import CheckError, FileError, UsageError
 
     start = time.perf_counter()
     if precision not in (None, *verification.PRECISIONS):
@@ -229,6 +229,10 @@ def verify(specs: tuple[str, ...], precision: int | None, folder: Path | None, d
         from whitefurnace import plots
 
         plots.require()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+        except OSError as error:
+            raise FileError(f"{folder}: cannot be made: {error.strerror}") from None
     on = choose_device(device)
     both = verification.PRECISIONS if on.fp64 else (32,)
     if precision is None and not on.fp64 and not quiet:
@@ -364,8 +368,8 @@ def main(argv: list[str] | None = None) -> None:
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError):
                 stream.flush()
-        # Not sys.exit: an interrupt inside an exec, as of a dataclass at import, marks the process, and Python then ends it
-        # by the signal whatever is asked.
+        # Not sys.exit: an interrupt inside an exec, as of a dataclass at import, marks the process, and Python then
+        # ends it by the signal whatever is asked.
         os._exit(130)
     except BrokenPipeError:  # the reader of stdout went away; what it did not read cannot be flushed either
         _abandon_stdout()

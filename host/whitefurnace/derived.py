@@ -150,8 +150,8 @@ class Areas:
             worst = distinct[:, np.abs(zero / coarse - 1).argmax()]
             where = dict(zip(self.entry.arguments, worst.tolist(), strict=True))
             own = ", ".join(f"{p.name} = {where[p.name]:g}" for p in self.entry.parameters)
-            why = "infinite, since D grows like 1/cos θ at grazing or faster" if not np.isnan(zero + coarse).any() else \
-                "not a number, since D is not one somewhere"
+            why = "not a number, since D is not one somewhere" if np.isnan(zero + coarse).any() else \
+                "infinite, since D grows like 1/cos θ at grazing or faster"
             raise UnsupportedError(f"ndf {self.entry.name} has no Smith masking{' for ' if own else ''}{own}: its "
                                    f"projected area is {why}")
         scale = np.maximum(np.minimum(zero, width), 1e-7)

@@ -106,12 +106,20 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
     for begin in range(0, grid.size, CELLS_A_LAUNCH):
         end = min(begin + CELLS_A_LAUNCH, grid.size)
         total = sum(_average(part, grid, begin, end, tolerance, tally) if entry.name == "albedo_average" else
-                    _climb(part, grid.rows(part, begin, end), tolerance, tally) for part in parts)
+                    _at_grazing(part, grid.rows(part, begin, end), tolerance, tally) for part in parts)
         flat[begin:end] = np.asarray(total).T
         if progress:
             progress(end / grid.size)
-    return Integrated(values, tally.error * len(parts), tally.evaluations, time.perf_counter() - start,
-                      tally.rule.name if tally.rule else "", (*tally.notices(), *_of_files(parts, flat)))
+    error = tally.error * len(parts)
+    return Integrated(values, error, tally.evaluations, time.perf_counter() - start,
+                      tally.rule.name if tally.rule else "",
+                      (*tally.notices(), *missed(error, tolerance, precision), *_of_files(parts, flat)))
+
+
+def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
+    """A notice where the tolerance is missed by more than the rounding of a value of 1 and as much again."""
+    if not error <= 2 * max(tolerance, ROUNDING[precision]):
+        yield f"the error of {error:.2g} is over the tolerance of {tolerance:g}: the finest rule did not reach it"
 
 
 def _of_files(parts: Sequence[_Part], flat: np.ndarray) -> Iterator[str]:
@@ -189,8 +197,9 @@ def _slots(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
         provided = {f for choice in slots.values() for f in choice.model.provides}
         missing = [f for f in entry.needs if f not in provided and f.split("_")[0].lower() in slots]
         if missing:
-            raise UnsupportedError(f"integral {entry.name}: {', '.join(c.model.name for c in slots.values())} "
-                                   f"give no {', '.join(missing)}")
+            owners = [(slots[f.split("_")[0].lower()].model, f.split("_", 1)[1]) for f in missing]
+            raise UnsupportedError(f"integral {entry.name}: " + ", ".join(
+                f"{owner.slot} {owner.name} has no {what}" for owner, what in owners))
     elif diffuse is None:
         raise UsageError(f"integral {entry.name} needs an ndf{', a diffuse model or a brdf' if albedo else ''}")
     if diffuse is not None:
@@ -465,12 +474,28 @@ def _example(part: _Part, rows: np.ndarray, values: np.ndarray) -> str:
     return ": " + ", ".join(f"{name} = {value:g}" for name, value in zip(names, rows[:, bad[0]], strict=True))
 
 
+def _at_grazing(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally) -> np.ndarray:
+    """`_climb`, and infinity where a diffuse albedo is infinite at n·v = 0, as its closed form says (Minnaert's)."""
+    along = np.flatnonzero(rows[0] == 0) if "diffuse" in part.slots else np.empty(0, int)
+    closed = part.slots["diffuse"].reference.get("albedo") if along.size else None
+    if closed is None:
+        return _climb(part, rows, tolerance, tally)
+    own = {p.name: rows[1 + k, along] for k, p in enumerate(part.slots["diffuse"].parameters)}
+    with np.errstate(all="ignore"):
+        infinite = along[np.isinf(closed(rows[0, along], **own))]
+    rows[0, infinite] = 1  # any view that has an answer
+    values = _climb(part, rows, tolerance, tally)
+    values[:, infinite] = np.inf
+    return values
+
+
 def _average(part: _Part, grid: _Grid, begin: int, end: int, tolerance: float, tally: _Tally) -> np.ndarray:
     """(components, n): 2∫ E(μ) μ dμ with μ = x² (the grazing end wants nodes), by rules of more and more nodes."""
     out = np.empty((part.components, end - begin))
     for some in _slices(begin, end, 512):
         rows = grid.rows(part, *some)
         before: np.ndarray | None = None
+        last = np.inf  # two steps must be small: one alone can be luck
         for count in AVERAGE_RULES:
             x, w = gauss(count)
             many = np.repeat(rows, count, 1)
@@ -481,7 +506,8 @@ def _average(part: _Part, grid: _Grid, begin: int, end: int, tolerance: float, t
             tally.promoted += inner.promoted
             tally.rule = inner.rule
             value = E @ (4 * w * x**3)
-            change = np.inf if before is None else float(np.abs(value - before).max())
+            step = np.inf if before is None else float(np.abs(value - before).max())
+            change, last = max(step, last), step if before is not None else last
             before = value
             if change + inner.error <= max(tolerance, 2 * inner.error):
                 break

@@ -238,6 +238,8 @@ def _lit(kind: str, light: Spec | None, around: Any, normal: Sequence[float] | N
     if (light is None) == (around is None):
         raise UsageError("integral radiance needs either a light or an environment")
     if light is not None:
+        if normal is not None or rotate or exposure:
+            raise UsageError("normal, rotate and exposure are of an environment; a light lies in the surface's frame")
         return {"light": chosen("light", light)}, {}
     env = load(around, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     up = (0.0, 1.0, 0.0) if normal is None else tuple(map(float, normal))

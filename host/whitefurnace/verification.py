@@ -432,7 +432,7 @@ def _kernel_area(b: Bench) -> Iterator[Row]:
                 {**dict(zip(("theta_v", "phi_v"), angles, strict=False)), **own})
 
 
-DRAWS = 1 << 16
+DRAWS = 1 << 19
 RADIAL, AZIMUTHAL = 24, 8
 
 
@@ -683,9 +683,10 @@ def _albedo(b: Bench) -> Iterator[Row]:
         with np.errstate(all="ignore"):
             want = b.model.reference["albedo"](np.maximum(NoV, LEAST_COSINE), **columns)
             finite = np.isfinite(b.model.reference["albedo"](NoV, **columns))
-        # Where it has no limit at grazing, any value does.
-        yield b.row("albedo", values, np.where(finite, want, values), b.tolerance("albedo", INTEGRAL) * size, where,
-                    note=note)
+        # Where it is infinite at grazing it must be said to be.
+        infinite = ~finite & np.isinf(values)
+        yield b.row("albedo", np.where(infinite, 0.0, values), np.where(infinite, 0.0, want),
+                    b.tolerance("albedo", INTEGRAL) * np.where(infinite, 1.0, size), where, note=note)
     if b.model.facts.get("energy") == "conserving":
         yield b.row("energy: albedo", values, 1.0, INTEGRAL[b.precision], where, bound="most", note=note)
     largest = b.model.facts.get("largest albedo", math.inf)

@@ -29,7 +29,7 @@ ENTRY = Model(
         *(Parameter(f"normal_{axis}", f"k{axis}", "any length", -_FAR, _FAR, (typical,),
                     f"{axis} of the normal, of any length: the side that shines", default=down)
           for axis, typical, down in zip("xyz", (0.1, 0.2, -1.0), (0.0, 0.0, -1.0), strict=True)),
-        Parameter("radius", "R", "any length", 1e-6, _FAR, (0.1, 1.0), "radius"),
+        Parameter("radius", "R", "any length", 1e-6, _FAR, (0.1, 1.0), "that of the disc"),
         Parameter("radiance", "L", "W/(m²·sr)", 0.0, 1e30, (1.0,), "radiance of every point of it", default=1.0),
     ),
     provides=("LIGHT_L",),
