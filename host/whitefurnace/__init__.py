@@ -24,10 +24,11 @@ _HOMES = {
     "lut": "tables",
     "prefilter": "lighting",
     "sample": "sampling",
+    "without_sun": "suns",
 }
 
 __all__ = ["__version__", "bake", "dfg", "environment", "harmonics", "integrate", "irradiance", "lut", "prefilter",
-           "sample"]
+           "sample", "without_sun"]
 
 if TYPE_CHECKING:
     from whitefurnace.baking import bake
@@ -36,6 +37,7 @@ if TYPE_CHECKING:
     from whitefurnace.lighting import harmonics, irradiance, prefilter
     from whitefurnace.run import dfg
     from whitefurnace.sampling import sample
+    from whitefurnace.suns import without_sun
     from whitefurnace.tables import lut
 
 

@@ -25,6 +25,7 @@ from whitefurnace.lighting import Lighting, light
 from whitefurnace.plan import LevelPlan, plan_chain
 from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain
 from whitefurnace.run import Integrated, dfg
+from whitefurnace.suns import Sun, sun_mode, without_sun
 from whitefurnace.version import VERSION
 
 DEMO = "demo"
@@ -88,11 +89,13 @@ class Order:
     rotate: float
     exposure: float
     nonfinite: str
+    sun: str
     force: bool
 
 
 def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str = "raw", rotate: float = 0.0,
-          exposure: float = 0.0, nonfinite: str = "refuse", force: bool = False, **options: Any) -> Order:
+          exposure: float = 0.0, nonfinite: str = "refuse", sun: str = "keep", force: bool = False,
+          **options: Any) -> Order:
     """A validated order; `options` are those of `recipe.chain`. Raises UsageError, UnsupportedError."""
     if not sources:
         raise UsageError("no environment was given")
@@ -112,8 +115,9 @@ def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str =
             raise UsageError(f"two inputs are named {name!r}: their outputs would be the same files")
         if name in ("", ".", "..") or "/" in name or "\\" in name:
             raise UsageError(f"{name!r} cannot name an output")
+    sun_mode(sun)
     return Order(tuple(names), tuple(sources), Path(output), engines(for_), chain(**options), float(rotate),
-                 float(exposure), nonfinite, force)
+                 float(exposure), nonfinite, sun, force)
 
 
 def _is_demo(item: Any) -> bool:
@@ -126,11 +130,11 @@ def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str |
          **options: Any) -> list[Baked]:
     """Bakes environments (a path, an array, an `environment`, or a list of them; `demo` is built in) into `output`.
 
-    options: for_ ("raw,exr"), size, min_size, ndf, tolerance or quality, rotate (degrees), exposure (stops),
-    nonfinite ("refuse", "zero"), force. Files go to `output/ENGINE/STEM…`; `output/STEM.json`, written last,
-    proves the rest whole. An environment whose manifest has the same key is skipped. Raises UsageError,
-    FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an environment
-    that fails.
+    options: for_ ("raw,exr"), size, min_size, ndf, tolerance or quality, rotate (degrees), exposure (stops), nonfinite
+    ("refuse", "zero"), sun ("keep", "extract", "clamp=X"), force. Files go to `output/ENGINE/STEM…`;
+    `output/STEM.json`, written last, proves the rest whole. An environment whose manifest has the same key is skipped.
+    Raises UsageError, FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an
+    environment that fails.
     """
     single = isinstance(sources, (str, os.PathLike, np.ndarray, Environment))
     request = order([sources] if single else list(sources), output, **options)
@@ -157,6 +161,7 @@ def _bake_one(request: Order, k: int, device: Device | str | None, dry_run: bool
     # With its rotation and exposure applied: the kernels see the environment only through these.
     env = environment(item, rotate=request.rotate, exposure=request.exposure,
                       nonfinite=request.nonfinite)  # type: ignore[arg-type]
+    env, sun = without_sun(env, request.sun)
     recipe = _canonical(request, env)
     key = _key(env, recipe, request.recipe.ndf.model)
     targets = _targets(request, name)
@@ -179,7 +184,7 @@ def _bake_one(request: Order, k: int, device: Device | str | None, dry_run: bool
     try:
         for folder in folders:
             _check_writable(folder)
-        return _make(request, k, env, recipe, key, device, on, progress, there, planned, begin)
+        return _make(request, k, env, sun, recipe, key, device, on, progress, there, planned, begin)
     except BaseException:
         for folder in reversed(made):
             with contextlib.suppress(OSError):  # not empty: something of ours is whole
@@ -187,9 +192,9 @@ def _bake_one(request: Order, k: int, device: Device | str | None, dry_run: bool
         raise
 
 
-def _make(request: Order, k: int, env: Environment, recipe: dict[str, Any], key: str, device: Device | str | None,
-          on: Device | None, progress: Callable[[str, str, float], None] | None, there: dict[str, Any] | None,
-          planned: tuple[LevelPlan, ...], begin: float) -> Baked:
+def _make(request: Order, k: int, env: Environment, sun: Sun | None, recipe: dict[str, Any], key: str,
+          device: Device | str | None, on: Device | None, progress: Callable[[str, str, float], None] | None,
+          there: dict[str, Any] | None, planned: tuple[LevelPlan, ...], begin: float) -> Baked:
     """Bakes and writes; `there` is the manifest that is replaced."""
     name = request.names[k]
     path = request.output / f"{name}.json"
@@ -197,7 +202,7 @@ def _make(request: Order, k: int, env: Environment, recipe: dict[str, Any], key:
     tell = (lambda what, share: progress(name, what, share)) if progress else None
     lit = light(on, env, request.recipe, latlong=any(e.latlong for e in request.engines), seed=key, progress=tell)
     table = dfg(DFG_SIZE, ndf=request.recipe.ndf, tolerance=DFG_TOLERANCE, device=on)
-    manifest = _manifest(name, env, recipe, key, on, lit, table)
+    manifest = _manifest(name, env, sun, recipe, key, on, lit, table)
     with Transaction() as transaction:
         digests = {}
         provenance = {"version": VERSION, "key": key, "source": env.digest,
@@ -248,7 +253,7 @@ def _canonical(request: Order, env: Environment) -> dict[str, Any]:
     """The recipe as data: everything that changes the bytes, and nothing else."""
     return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines),
             "rotate": round(math.degrees(env.rotation), 9),
-            "exposure": env.exposure, "nonfinite": request.nonfinite, "irradiance": IRRADIANCE_SIZE,
+            "exposure": env.exposure, "nonfinite": request.nonfinite, "sun": request.sun, "irradiance": IRRADIANCE_SIZE,
             "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE}}
 
 
@@ -310,8 +315,8 @@ def _check_writable(output: Path) -> None:
         raise FileError(f"cannot write into {output}: {error.strerror or error}") from error
 
 
-def _manifest(name: str, env: Environment, recipe: dict[str, Any], key: str, device: Device, lit: Lighting,
-              table: Integrated) -> dict[str, Any]:
+def _manifest(name: str, env: Environment, sun: Sun | None, recipe: dict[str, Any], key: str, device: Device,
+              lit: Lighting, table: Integrated) -> dict[str, Any]:
     def row(level: Any, kept: float | None = None) -> dict[str, Any]:
         data = {"size": level.texels.shape[-2], "roughness": level.roughness, "method": level.method,
                 "pairs": level.pairs, "error": level.error, "worst": level.worst, "rmse": level.rmse}
@@ -325,6 +330,7 @@ def _manifest(name: str, env: Environment, recipe: dict[str, Any], key: str, dev
         "device": device.identity(),
         "source": {"sha256": env.digest, "layout": env.layout, "statistics": env.statistics,
                    "notices": list(env.notices)},
+        **({} if sun is None else {"sun": sun.data()}),
         "levels": [row(level, kept) for level, kept in zip(lit.levels, lit.energy_kept, strict=True)],
         "latlong_levels": [row(level) for level in lit.latlongs],
         "coverage_levels": [row(level) for level in (*lit.coverage, *lit.latlong_coverage)],

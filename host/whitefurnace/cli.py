@@ -54,6 +54,8 @@ def cli(context: click.Context) -> None:
 @click.option("--exposure", metavar="EV", type=float, default=0.0, help="Multiply radiance by 2^EV.")
 @click.option("--nonfinite", metavar="refuse|zero", default="refuse", show_default=True,
               help="What to do with NaN, infinite and negative values.")
+@click.option("--sun", metavar="keep|extract|clamp=X", default="keep", show_default=True,
+              help="Take the sun out as a directional light, or leave no texel over X times the mean.")
 @click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done and written, and do nothing.")
 @click.option("--force", is_flag=True, help="Bake again, and replace files that are not known to be ours.")

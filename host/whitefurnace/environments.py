@@ -160,7 +160,7 @@ def environment(
     if exposure != 0:
         _expose(found.texels, exposure, found.name)
         found = replace(found, exposure=found.exposure + exposure)
-    return replace(found, statistics=_statistics(found))
+    return replace(found, statistics=statistics_of(found))
 
 
 def _is_number(value: object) -> bool:
@@ -360,7 +360,8 @@ def _expose(texels: npt.NDArray[np.float32], exposure: float, name: str) -> None
         )
 
 
-def _statistics(env: Environment) -> dict[str, Any]:
+def statistics_of(env: Environment) -> dict[str, Any]:
+    """What `Environment.statistics` holds, from its texels."""
     height, width = env.texels.shape[-3:-1]
     rows = env.texels.reshape(-1, width, 3)
     if env.kind == "latlong":

@@ -57,10 +57,17 @@ def baked_text(baked: Baked, output: Path) -> str:
     rows.append(["irradiance SH", "9×3", "", f"{m['sh']['error']:.1e}", "", "", "texel-nodes", ""])
     d = m["dfg"]
     rows.append(["DFG", f"{d['size']}²", "", f"{d['error']:.1e}", "", "", d["rule"], ""])
+    if "sun" in m:
+        sun = m["sun"]
+        triple = ", ".join(f"{x:.4g}" for x in sun["irradiance"])
+        towards = ", ".join(f"{x:.4f}" for x in sun["direction"])
+        rows.append(["sun", f"{math.degrees(2 * sun['angular_radius']):.2f}°", "", "", "", "", "extracted", ""])
     s = m["source"]["statistics"]
     lines = [f"{baked.name}: {m['source']['layout']} {s['width']}×{s['height']}, brightest texel "
              f"{s['max_over_mean']:.3g} × the mean, on {m['device']['name']} ({m['device']['platform']})",
              table(["", "size", "r", "error", "worst", "rmse", "method", "time"], rows)]
+    if "sun" in m:
+        lines.append(f"  sun: direction ({towards}), irradiance facing it ({triple}), π times the light colour c")
     for relative, entry in sorted(m["files"].items()):
         lines.append(f"  wrote {output / relative}  {size(entry['bytes'])}")
     lines.append(f"  wrote {output / (baked.name + '.json')}  the manifest; {baked.seconds:.2f} s in all")
@@ -92,6 +99,7 @@ def baked_rows(baked: Baked) -> list[dict[str, Any]]:
     if baked.state == "planned":
         whole |= {"recipe": m["recipe"], "files": {str(p): n for p, n in zip(baked.files, baked.nbytes, strict=True)}}
     else:
+        whole |= {"sun": m["sun"]} if "sun" in m else {}
         whole |= {"files": m["files"], "device": m["device"], "irradiance": m["irradiance"], "dfg": m["dfg"],
                   "sh": m["sh"]}
     return [*rows, whole]
