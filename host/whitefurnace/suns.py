@@ -123,8 +123,8 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
     held = around[level[around] > bound]
     beyond = ring[level[ring] > bound]
     if float(level[beyond] @ weights[beyond]) > WIDER * float(level[held] @ weights[held]):
-        return _told(env, env.texels, "no sun was found: what stands out about the brightest texel reaches further than "
-                                      f"{math.degrees(CAP):g}°, a panel rather than a sun"), None
+        return _told(env, env.texels, "no sun was found: what stands out about the brightest texel reaches further "
+                                      f"than {math.degrees(CAP):g}°, a panel rather than a sun"), None
     towards = _directions(env, held)
     centre = towards @ (level[held] * weights[held])
     centre /= np.linalg.norm(centre)
@@ -143,8 +143,8 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
     irradiance = (weights[held] * (centre @ towards)) @ excess
     share = float(power.mean()) / energy
     if share < LEAST:
-        return _told(env, env.texels, f"no sun was found: what stands out most holds {100 * share:.2g} % of the energy, and "
-                                      f"{100 * LEAST:g} % is what is looked for"), None
+        return _told(env, env.texels, f"no sun was found: what stands out most holds {100 * share:.2g} % of the energy "
+                                      f"and {100 * LEAST:g} % is what is looked for"), None
     sun = Sun(tuple(centre.tolist()), math.acos(max(-1.0, 1 - solid / (2 * math.pi))), tuple((power / solid).tolist()),
               tuple(irradiance.tolist()), tuple((irradiance / math.pi).tolist()), share, int(held.size))
     told = (f"the sun was taken out of {held.size} texel{'s' if held.size > 1 else ''}, {100 * share:.3g} % of the "
