@@ -773,3 +773,9 @@ def test_a_missed_tolerance_is_said(device: Device) -> None:
     assert missed.error > 2e-6 and any("over the tolerance" in notice for notice in missed.notices)
     met = integrate("albedo", ndf="ggx", alpha=0.3, NoV=0.5, device=device)
     assert not any("tolerance" in notice for notice in met.notices)
+
+
+@pytest.mark.parametrize("wrong", [{"tolerance": "fine"}, {"tolerance": True}, {"ndf": 3}, {"masking": None}], ids=str)
+def test_what_is_no_number_and_no_name_is_said(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        integrate("albedo", **{"ndf": "ggx", "NoV": 0.5, "alpha": 0.3, **wrong})  # type: ignore[arg-type]

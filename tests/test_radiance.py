@@ -321,7 +321,7 @@ def test_the_specular_brdf_is_reciprocal(device: Device, ndf: str, masking: str)
     slots = {"ndf": model("ndf", ndf), "masking": model("masking", masking), "fresnel": model("fresnel", "schlick")}
     n, precision = 300, 64 if device.fp64 else 32
     to, v = (direction(rng.uniform(0.01, 1, n), rng.uniform(0, 6.28, n)) for _ in range(2))
-    part = engine._Part(device, integral("albedo"), slots, precision)
+    part = engine.Part(device, integral("albedo"), slots, precision)
     own = {p.name: p.typical[len(p.typical) // 2] for m in slots.values() for p in m.parameters}
     rows = np.stack([*(np.ones(n) for _ in part.view), *(np.full(n, own[p.name]) for m in slots.values()
                                                          for p in m.parameters)])

@@ -19,22 +19,22 @@ from whitefurnace.device import Buffer, Device, choose_device
 from whitefurnace.environments import Environment, environment
 from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.outlines import outline, panels
-from whitefurnace.recipe import Chosen, Spec, chosen
+from whitefurnace.recipe import Chosen, Spec, chosen, is_number
 from whitefurnace.run import (
     DEFAULT_TOLERANCE,
     ROUNDING,
     Demand,
+    Grid,
     Integrated,
+    Part,
     Progress,
-    _climb,
-    _Grid,
-    _grid,
-    _Part,
-    _parts,
-    _room,
-    _slots,
-    _summands,
-    _Tally,
+    Tally,
+    climb,
+    grid_of,
+    parts_of,
+    room_for,
+    slots_of,
+    summands_of,
 )
 from whitefurnace.sphere import composite, cube_directions, cube_tables, latlong_tables
 
@@ -89,7 +89,7 @@ def radiance(*, light: Spec | None = None, environment: Any = None, normal: Sequ
         raise UsageError("integral radiance needs either a light or an environment")
     defaults = DEFAULT_TOLERANCE if environment is None else ENVIRONMENT_TOLERANCE
     tolerance = defaults[precision] if tolerance is None else tolerance
-    if not 0 < tolerance < 1:
+    if not is_number(tolerance) or not 0 < tolerance < 1:
         raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
     for name, value, default in (("normal", normal, None), ("rotate", rotate, 0.0), ("exposure", exposure, 0.0),
                                  ("nonfinite", nonfinite, "refuse")):
@@ -99,7 +99,7 @@ def radiance(*, light: Spec | None = None, environment: Any = None, normal: Sequ
     smooth = ndf is None and diffuse is None and brdf is None
     slots = _chosen(light, ndf, masking, fresnel, diffuse, brdf)
     models = {slot: c.model for slot, c in slots.items() if slot != "light"}
-    grid = _grid(entry, slots, dict(parameters), backfacing)
+    grid = grid_of(entry, slots, dict(parameters), backfacing)
     on = device if isinstance(device, Device) else choose_device(device)
     if precision == 64 and not on.fp64:
         raise UnsupportedError(f"{on.identity()['name']} has no float64")
@@ -116,7 +116,7 @@ def _chosen(light: Spec | None, ndf: Spec | None, masking: Spec, fresnel: Spec, 
     """The slots, filled; a perfectly smooth surface has its Fresnel alone."""
     smooth = ndf is None and diffuse is None and brdf is None
     slots = {"fresnel": chosen("fresnel", fresnel)} if smooth else \
-        _slots(integral("radiance"), ndf, masking, fresnel, diffuse, brdf)
+        slots_of(integral("radiance"), ndf, masking, fresnel, diffuse, brdf)
     if light is not None:
         slots["light"] = chosen("light", light)
         if smooth and slots["light"].model.name == "punctual":
@@ -130,7 +130,7 @@ def radiance_demand(*, light: Spec | None, ndf: Spec | None = None, masking: Spe
                     **parameters: Any) -> Demand:
     """What `radiance` would do, as `run.demand` tells of the other integrals; without a light, for an environment."""
     entry, slots = integral("radiance"), _chosen(light, ndf, masking, fresnel, diffuse, brdf)
-    shape = _grid(entry, slots, dict(parameters), backfacing).shape
+    shape = grid_of(entry, slots, dict(parameters), backfacing).shape
     return Demand(entry, slots, (*shape, 3) if light is None or "brdf" in slots else shape, (source.everything(),))
 
 
@@ -142,7 +142,7 @@ def _fill(task: _Task, how: Callable[[_Task, int, int], np.ndarray], components:
     """
     grid = task.grid
     own = grid.rgb and components == 3
-    values = _room(grid.shape if own or components == 1 else (*grid.shape, components), task.precision, out)
+    values = room_for(grid.shape if own or components == 1 else (*grid.shape, components), task.precision, out)
     flat = values.reshape(grid.size, -1)
     for begin in range(0, grid.size, CELLS_A_TIME):
         end = min(begin + CELLS_A_TIME, grid.size)
@@ -161,15 +161,15 @@ class _Task:
     entry: Integral
     slots: dict[str, Chosen]
     models: dict[str, Model]  # of the BRDF: without the light
-    grid: _Grid
+    grid: Grid
     precision: int
     tolerance: float
     progress: Progress | None
-    tally: _Tally = field(default_factory=_Tally)
+    tally: Tally = field(default_factory=Tally)
     rule: str = ""
     errors: dict[str, float] = field(default_factory=dict)  # by summand
     closed: int = 0  # evaluations of closed forms
-    parts: dict[str, list[_Part]] = field(default_factory=dict)
+    parts: dict[str, list[Part]] = field(default_factory=dict)
 
     def column(self, name: str, begin: int, end: int) -> np.ndarray:
         return self.grid.part(name, begin, end)
@@ -202,7 +202,7 @@ class _Task:
 def _at(task: _Task, function: str, slots: Mapping[str, Model], arguments: np.ndarray, begin: int,
         end: int) -> tuple[np.ndarray, float]:
     """(components, n): a function of the slots at arguments (rows, n), finest precision; the error of its table."""
-    part = _Part(task.device, integral("albedo"), dict(slots), finest(task.device))
+    part = Part(task.device, integral("albedo"), dict(slots), finest(task.device))
     numbers, terms, error = part.cells(task.grid.rows(part, begin, end), part.precision)
     cells = np.concatenate([arguments, numbers[len(part.view):]])
     found = evaluate(task.device, function, slots, cells, part.precision, terms)
@@ -250,7 +250,7 @@ def _punctual(task: _Task, begin: int, end: int) -> np.ndarray:
     up[2] = 1
     lit = _light_at(task, "LIGHT_C", up, begin, end)
     total: Any = 0.0
-    for some in _summands(task.slots):
+    for some in summands_of(task.slots):
         function = "SPECULAR_F" if "ndf" in some else "DIFFUSE_F" if "diffuse" in some else "BRDF_F"
         f, error = _at(task, function, some, arguments, begin, end)
         value = np.where(lit > 0, math.pi * f * lit, 0.0)
@@ -275,9 +275,9 @@ def _albedo(task: _Task, begin: int, end: int) -> tuple[np.ndarray, float]:
     """(components, n) directional albedos and their error."""
     if "albedo" not in task.parts:
         brdf = {slot: c for slot, c in task.slots.items() if slot != "light"}
-        task.parts["albedo"] = _parts(task.device, integral("albedo"), brdf, task.precision)
+        task.parts["albedo"] = parts_of(task.device, integral("albedo"), brdf, task.precision)
     parts = task.parts["albedo"]
-    total = sum(_climb(part, task.grid.rows(part, begin, end), task.tolerance, task.tally) for part in parts)
+    total = sum(climb(part, task.grid.rows(part, begin, end), task.tolerance, task.tally) for part in parts)
     return np.asarray(total), task.tally.error * len(parts)
 
 
@@ -286,7 +286,7 @@ def _widths(task: _Task, slots: Mapping[str, Model], begin: int, end: int) -> np
     n = end - begin
     if "ndf" not in slots:
         return np.full((n, 2), source.LOBE_WIDTH if "brdf" in slots else 1.0)
-    part = _Part(task.device, integral("albedo"), {"ndf": slots["ndf"]}, finest(task.device))
+    part = Part(task.device, integral("albedo"), {"ndf": slots["ndf"]}, finest(task.device))
     numbers, _, _ = part.cells(task.grid.rows(part, begin, end), part.precision)
     names = ("NDF_WIDTH",) if slots["ndf"].isotropic else ("NDF_STRETCH_X", "NDF_STRETCH_Y")
     distinct, which = unique_rows(numbers[len(part.view):])
@@ -305,7 +305,7 @@ def _blur(widths: np.ndarray, NoV: np.ndarray, precision: int) -> np.ndarray:
 
 
 @dataclass
-class _Outlined(_Part):
+class _Outlined(Part):
     """A summand of the BRDF over the outline of an area light: cells are summed from their panels."""
 
     light: Model | None = None
@@ -372,7 +372,7 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
     _refuse_flat(model.name, light)
     if "area" not in task.parts:
         task.parts["area"] = [_Outlined(task.device, task.entry, some, task.precision, light=model)
-                              for some in _summands(task.slots)]
+                              for some in summands_of(task.slots)]
     total: Any = 0.0
     error = 0.0
     for part in task.parts["area"]:
@@ -382,7 +382,7 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
         names = [*part.view[:-1], *(f"{slot}_{p.name}" for slot, m in part.slots.items() for p in m.parameters)]
         rows = np.stack([task.column(name, begin, end) for name in names])
         rows = np.insert(rows, len(part.view) - 1, np.arange(end - begin), 0)
-        tally = _Tally()
+        tally = Tally()
         NoV = task.column("NoV", begin, end)
         sharp = np.zeros(end - begin, bool)
         if task.precision == 32 and task.device.fp64:
@@ -390,7 +390,7 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
         values = np.empty((part.components, end - begin))
         for some, precision in ((~sharp, task.precision), (sharp, 64)):
             if some.any():
-                values[:, some] = _climb(part, rows[:, some], task.tolerance, tally, precision)
+                values[:, some] = climb(part, rows[:, some], task.tolerance, tally, precision)
                 tally.error += float(_blur(part.widths[some], NoV[some], precision).max())
         tally.promoted += int(sharp.sum())
         error += tally.error + part.largest
@@ -456,7 +456,7 @@ def frame_of(normal: Sequence[float]) -> np.ndarray:
     return np.stack([turned(np.array([1.0, 0, 0])), turned(np.array([0, 0, -1.0])), np.array([x, y, z])])
 
 
-class _Turned(_Part):
+class _Turned(Part):
     """The whole BRDF, whose cells have an azimuth whatever its models."""
 
     @property

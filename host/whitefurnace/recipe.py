@@ -3,10 +3,13 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from whitefurnace.catalogue import Model, model
 from whitefurnace.catalogue.user import user_model
@@ -32,7 +35,7 @@ class Chosen:
         return {"name": self.model.name, **source, **dict(sorted(self.given.items()))}
 
 
-Spec = str | Model | Chosen
+Spec = str | os.PathLike[str] | Model | Chosen
 
 
 def file_of(spec: str) -> str | None:
@@ -51,6 +54,9 @@ def chosen(slot: str, spec: Spec) -> Chosen:
         return spec
     if isinstance(spec, Model):
         return Chosen(spec, {})
+    if not isinstance(spec, str | os.PathLike):
+        raise UsageError(f"{slot} is {spec!r}; a name, a path or a catalogue entry was expected")
+    spec = os.fspath(spec)
     file = file_of(spec)
     if file is not None:
         entry, rest = user_model(slot, file), spec[len(file) + 1:]
@@ -80,6 +86,11 @@ def chosen(slot: str, spec: Spec) -> Chosen:
         known[key].check(numbers, where)
         given[key] = numbers[0] if len(numbers) == 1 else numbers
     return Chosen(entry, given)
+
+
+def is_number(value: object) -> bool:
+    """Whether `value` is one real number, of Python or numpy."""
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
 
 
 def tolerance_of(tolerance: float | None, quality: str | None) -> float:

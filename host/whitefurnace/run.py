@@ -15,7 +15,7 @@ from whitefurnace.cells import CELLS_A_LAUNCH, over_nodes
 from whitefurnace.derived import Areas, numbers_of
 from whitefurnace.device import Device, choose_device
 from whitefurnace.errors import CheckError, UnsupportedError, UsageError, nearest
-from whitefurnace.recipe import Chosen, Spec, chosen
+from whitefurnace.recipe import Chosen, Spec, chosen, is_number
 
 DEFAULT_TOLERANCE = {32: 1e-6, 64: 1e-12}
 BACKFACING = ("clamp", "absolute")
@@ -90,19 +90,19 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
     _refuse_lit(entry)
     if tolerance is None:
         tolerance = DEFAULT_TOLERANCE[precision]
-    if not 0 < tolerance < 1:
+    if not is_number(tolerance) or not 0 < tolerance < 1:
         raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
-    slots = _slots(entry, ndf, masking, fresnel, diffuse, brdf)
-    grid = _grid(entry, slots, dict(parameters), backfacing)
+    slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
+    grid = grid_of(entry, slots, dict(parameters), backfacing)
     on = device if isinstance(device, Device) else choose_device(device)
     if precision == 64 and not on.fp64:
         raise UnsupportedError(f"{on.identity()['name']} has no float64")
-    parts = _parts(on, entry, slots, precision)
+    parts = parts_of(on, entry, slots, precision)
     components = parts[0].components
     shape = grid.shape if components == 1 else (*grid.shape, components)
-    values = _room(shape, precision, out)
+    values = room_for(shape, precision, out)
     flat = values.reshape(grid.size, components)
-    tally = _Tally()
+    tally = Tally()
     for begin in range(0, grid.size, CELLS_A_LAUNCH):
         end = min(begin + CELLS_A_LAUNCH, grid.size)
         total = sum(_average(part, grid, begin, end, tolerance, tally) if entry.name == "albedo_average" else
@@ -122,7 +122,7 @@ def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
         yield f"the error of {error:.2g} is over the tolerance of {tolerance:g}: the finest rule did not reach it"
 
 
-def _of_files(parts: Sequence[_Part], flat: np.ndarray) -> Iterator[str]:
+def _of_files(parts: Sequence[Part], flat: np.ndarray) -> Iterator[str]:
     """What a user wants to hear of a model from a file: the norm that was divided out, or the range of its albedo."""
     for part in parts:
         for entry in part.slots.values():
@@ -152,16 +152,16 @@ def demand(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresn
     """The arguments of `integrate` checked, without a device. Raises what `integrate` raises of them."""
     entry = integral(name)
     _refuse_lit(entry)
-    slots = _slots(entry, ndf, masking, fresnel, diffuse, brdf)
-    shape = _grid(entry, slots, dict(parameters), backfacing).shape
-    digests = [_program(entry, some, 0).digest for some in _summands(slots)]
+    slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
+    shape = grid_of(entry, slots, dict(parameters), backfacing).shape
+    digests = [_program(entry, some, 0).digest for some in summands_of(slots)]
     if "ndf" in slots and slots["ndf"].model.isotropic:
         digests.append(source.area(slots["ndf"].model).digest)  # of the table, should it be needed
     components = 3 if "brdf" in slots else entry.components
     return Demand(entry, slots, shape if components == 1 else (*shape, components), tuple(digests))
 
 
-def _room(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.ndarray:
+def room_for(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.ndarray:
     """The array for the values: `out`, or a new one."""
     if out is None:
         return np.empty(shape, np.dtype(f"f{precision // 8}"))
@@ -178,7 +178,7 @@ def _refuse_lit(entry: Integral) -> None:
         raise UsageError("integral radiance needs a light or an environment: whitefurnace.integrate takes them")
 
 
-def _slots(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
+def slots_of(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
            diffuse: Spec | None, brdf: Spec | None) -> dict[str, Chosen]:
     """The slots an integral needs, filled; a slot it does not need is not compiled in."""
     albedo = entry.name in ("albedo", "albedo_average", "radiance")
@@ -208,7 +208,7 @@ def _slots(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
 
 
 @dataclass(frozen=True)
-class _Grid:
+class Grid:
     """Broadcast columns by (slot, parameter) or name, read in parts: nothing of the grid's size is made."""
 
     shape: tuple[int, ...]
@@ -225,13 +225,13 @@ class _Grid:
         return np.full(end - begin, float(column)) if column.ndim == 0 else np.asarray(
             np.broadcast_to(column, self.shape).flat[begin:end], np.float64)
 
-    def rows(self, part: _Part, begin: int, end: int) -> np.ndarray:
+    def rows(self, part: Part, begin: int, end: int) -> np.ndarray:
         """The parameter rows of one part of the BRDF, view first: (rows, end - begin)."""
         names = [*part.view, *(f"{slot}_{p.name}" for slot, m in part.slots.items() for p in m.parameters)]
         return np.stack([self.part(name, begin, end) for name in names])
 
 
-def _grid(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], backfacing: str | None) -> _Grid:
+def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], backfacing: str | None) -> Grid:
     """Every number the kernels need, checked against its domain, and the broadcast shape."""
     columns: dict[str, Any] = {}
     rgb: set[str] = set()
@@ -277,7 +277,7 @@ def _grid(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], b
                          + ", ".join(f"{k} {np.shape(v)}" for k, v in columns.items() if np.ndim(v))) from None
     if 0 in shape:
         raise UsageError("parameters hold no cell: an array is empty")
-    return _Grid(shape, columns, bool(rgb))
+    return Grid(shape, columns, bool(rgb))
 
 
 def _number(name: str, given: Any) -> np.ndarray:
@@ -311,7 +311,7 @@ def _view(given: Any, backfacing: str | None) -> np.ndarray:
 
 
 @dataclass
-class _Part:
+class Part:
     """One summand of the BRDF on a device: the specular one, the diffuse one or a user's whole one."""
 
     device: Device
@@ -389,19 +389,19 @@ def _program(entry: Integral, slots: Mapping[str, Model], terms: int) -> source.
     return source.hemisphere(next(iter(slots.values())))
 
 
-def _summands(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
+def summands_of(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
     """The models of each summand of the BRDF: the specular one, the diffuse one or a user's whole one."""
     specular = {slot: c.model for slot, c in slots.items() if slot in ("ndf", "masking", "fresnel")}
     return [some for some in (specular, *({slot: slots[slot].model} for slot in ("diffuse", "brdf") if slot in slots))
             if some]
 
 
-def _parts(device: Device, entry: Integral, slots: Mapping[str, Chosen], precision: int) -> list[_Part]:
-    return [_Part(device, entry, some, precision) for some in _summands(slots)]
+def parts_of(device: Device, entry: Integral, slots: Mapping[str, Chosen], precision: int) -> list[Part]:
+    return [Part(device, entry, some, precision) for some in summands_of(slots)]
 
 
 @dataclass
-class _Tally:
+class Tally:
     """What a run has cost and how far it is from the truth."""
 
     error: float = 0.0
@@ -420,7 +420,7 @@ class _Tally:
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
-def _climb(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally, precision: int | None = None) -> np.ndarray:
+def climb(part: Part, rows: np.ndarray, tolerance: float, tally: Tally, precision: int | None = None) -> np.ndarray:
     """(components, n): climbs the ladder, every block of cells until two neighbouring rules agree on it."""
     precision = precision or part.precision
     ladder = part.ladder
@@ -455,7 +455,7 @@ def _climb(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally, preci
     if active.size and precision == 32 and part.device.fp64:
         # Whole ladders end within float32's reach or stop at its rounding: float64 goes on from here.
         tally.promoted += active.size
-        values[:, active] = _climb(part, rows[:, active], tolerance, tally, 64)
+        values[:, active] = climb(part, rows[:, active], tolerance, tally, 64)
     elif active.size:
         left = float(np.max(max(UNFINISHED / slow, 1) * change + rounding))
         if not np.isfinite(left):
@@ -465,7 +465,7 @@ def _climb(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally, preci
     return values
 
 
-def _example(part: _Part, rows: np.ndarray, values: np.ndarray) -> str:
+def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
     """The first cell whose value is not finite, for a message."""
     bad = np.flatnonzero(~np.isfinite(values).all(0))
     if bad.size == 0:
@@ -474,22 +474,22 @@ def _example(part: _Part, rows: np.ndarray, values: np.ndarray) -> str:
     return ": " + ", ".join(f"{name} = {value:g}" for name, value in zip(names, rows[:, bad[0]], strict=True))
 
 
-def _at_grazing(part: _Part, rows: np.ndarray, tolerance: float, tally: _Tally) -> np.ndarray:
-    """`_climb`, and infinity where a diffuse albedo is infinite at n·v = 0, as its closed form says (Minnaert's)."""
+def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, tally: Tally) -> np.ndarray:
+    """`climb`, and infinity where a diffuse albedo is infinite at n·v = 0, as its closed form says (Minnaert's)."""
     along = np.flatnonzero(rows[0] == 0) if "diffuse" in part.slots else np.empty(0, int)
     closed = part.slots["diffuse"].reference.get("albedo") if along.size else None
     if closed is None:
-        return _climb(part, rows, tolerance, tally)
+        return climb(part, rows, tolerance, tally)
     own = {p.name: rows[1 + k, along] for k, p in enumerate(part.slots["diffuse"].parameters)}
     with np.errstate(all="ignore"):
         infinite = along[np.isinf(closed(rows[0, along], **own))]
     rows[0, infinite] = 1  # any view that has an answer
-    values = _climb(part, rows, tolerance, tally)
+    values = climb(part, rows, tolerance, tally)
     values[:, infinite] = np.inf
     return values
 
 
-def _average(part: _Part, grid: _Grid, begin: int, end: int, tolerance: float, tally: _Tally) -> np.ndarray:
+def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, tally: Tally) -> np.ndarray:
     """(components, n): 2∫ E(μ) μ dμ with μ = x² (the grazing end wants nodes), by rules of more and more nodes."""
     out = np.empty((part.components, end - begin))
     for some in _slices(begin, end, 512):
@@ -500,8 +500,8 @@ def _average(part: _Part, grid: _Grid, begin: int, end: int, tolerance: float, t
             x, w = gauss(count)
             many = np.repeat(rows, count, 1)
             many[0] = np.tile(x * x, rows.shape[1])
-            inner = _Tally()
-            E = _climb(part, many, tolerance / 2, inner).reshape(part.components, rows.shape[1], count)
+            inner = Tally()
+            E = climb(part, many, tolerance / 2, inner).reshape(part.components, rows.shape[1], count)
             tally.evaluations += inner.evaluations
             tally.promoted += inner.promoted
             tally.rule = inner.rule

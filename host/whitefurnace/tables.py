@@ -30,7 +30,7 @@ from whitefurnace.files import (
 )
 from whitefurnace.integrals import integrate
 from whitefurnace.radiance import ENVIRONMENT_TOLERANCE, radiance_demand
-from whitefurnace.recipe import Chosen, Spec, chosen
+from whitefurnace.recipe import Chosen, Spec, chosen, is_number
 from whitefurnace.run import DEFAULT_TOLERANCE, Demand, Integrated, demand, rows_of_roughness
 from whitefurnace.version import VERSION
 
@@ -197,7 +197,7 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
         raise UsageError("EXR holds float32: give .npy for precision 64")
     usual = DEFAULT_TOLERANCE if environment is None else ENVIRONMENT_TOLERANCE
     tolerance = usual[precision] if tolerance is None else tolerance
-    if not 0 < tolerance < 1:  # also NaN
+    if not is_number(tolerance) or not 0 < tolerance < 1:  # also NaN
         raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
     if ndf is None and diffuse is None and brdf is None:
         ndf = "ggx"

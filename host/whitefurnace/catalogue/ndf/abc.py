@@ -3,6 +3,7 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss
 
 from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.numerics import expm1_ratio
 from whitefurnace.catalogue.roughness import alpha_within
 
 B = Parameter("b", "B", "1", 0.0, 1e8, (0.0, 1e-3, 1.0, 30.0, 1e4, 1e6, 1e8),
@@ -11,11 +12,6 @@ C = Parameter("c", "C", "1", 0.0, 16.0, (0.0, 0.5, 1.0, 1.3, 2.0, 3.0, 16.0),
               "how steep: D falls like (1 - cos θ)^-c; 0 is the uniform lobe")
 # α at which b of GGX's peak, 2(1/α² - 1), is the largest.
 _ALPHA = Parameter("alpha", "α", "1", (2 / (B.high + 2)) ** 0.5, 1.0, (), "GGX's α of the same peak")
-
-
-def _expm1_ratio(x):
-    """(eˣ - 1)/x."""
-    return np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
 
 
 def _constants(b, c):
@@ -27,7 +23,7 @@ def _constants(b, c):
     b, c = np.broadcast_arrays(np.asarray(b, np.float64), np.asarray(c, np.float64))
     wide = np.maximum(b, 0.5)
     L = np.log1p(wide)
-    first, second = _expm1_ratio((1 - c) * L), _expm1_ratio((2 - c) * L)
+    first, second = expm1_ratio((1 - c) * L), expm1_ratio((2 - c) * L)
     closed = L / wide * (first - (second - first) / wide)
     small, sums = np.minimum(b, 0.5), np.zeros(b.shape)
     for x, w in zip(*leggauss(16), strict=True):

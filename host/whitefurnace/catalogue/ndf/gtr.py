@@ -2,17 +2,13 @@
 import numpy as np
 
 from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.numerics import expm1_ratio
 from whitefurnace.catalogue.roughness import alpha_within
 
 ALPHA = Parameter("alpha", "α", "1", 1e-4, 1.0, (1e-4, 1e-3, 0.01, 0.1, 0.5, 1.0),
                   "roughness, the square of the perceptual one")
 GAMMA = Parameter("gamma", "γ", "1", 0.0, 10.0, (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 10.0),
                   "steepness of the tail: 2 is GGX, 1 Burley's clearcoat, 0 the uniform lobe")
-
-
-def _expm1_ratio(x):
-    """(eˣ - 1)/x."""
-    return np.where(x == 0, 1.0, np.expm1(x) / np.where(x == 0, 1.0, x))
 
 
 def _constants(alpha, gamma):
@@ -23,7 +19,7 @@ def _constants(alpha, gamma):
     B = (1 - alpha) * (1 + alpha) / alpha**2
     L = np.log1p(B)
     ratio = np.where(B == 0, 1.0, L / np.where(B == 0, 1.0, B))
-    return {"peak": 1 / (np.pi * ratio * _expm1_ratio((1 - gamma) * L))}
+    return {"peak": 1 / (np.pi * ratio * expm1_ratio((1 - gamma) * L))}
 
 
 def _d(theta_m, alpha, gamma):
