@@ -23,12 +23,11 @@ from whitefurnace.sphere import (
     bounds,
     coarsening,
     composite,
-    cube_centres,
     cube_tables,
     grid_tangents,
-    latlong_centres,
     latlong_tables,
     row_edges,
+    source_directions,
 )
 
 Progress = Callable[[str, float], None]
@@ -467,7 +466,7 @@ class Convolver:
         """The NEAR_BRIGHT texels nearest the brightest sources, nearest to any of them."""
         if self.constant:
             return np.arange(0)
-        targets = self._texel_centres(self._brightest)
+        targets = source_directions(self.environment, self._brightest).T
         best, closeness = np.arange(0), np.empty(0)
         for first in range(0, shape.count, 1 << 18):
             index = np.arange(first, min(first + (1 << 18), shape.count))
@@ -476,13 +475,6 @@ class Convolver:
             keep = np.argpartition(-closeness, planning.NEAR_BRIGHT)[:planning.NEAR_BRIGHT]
             best, closeness = best[keep], closeness[keep]
         return np.sort(best)
-
-    def _texel_centres(self, index: np.ndarray) -> np.ndarray:
-        """(m, 3) directions of source texels by flat index."""
-        e = self.environment
-        d = latlong_centres(self.rows, self.columns, index) if self.latlong else cube_centres(self.rows, index)
-        c, s = math.cos(e.rotation), math.sin(e.rotation)
-        return np.stack([c * d[0] - s * d[2], d[1], s * d[0] + c * d[2]], 1)
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ from whitefurnace.catalogue import Model
 from whitefurnace.certificate import statement, texel_errors
 from whitefurnace.convolution import COSINE, EXACT_SHARE, ROUNDING, Convolver, Level, Lobe, Progress, ndf_lobe
 from whitefurnace.device import Device, choose_device
-from whitefurnace.environments import Environment, cube_solid_angles, environment, latlong_solid_angles
+from whitefurnace.environments import Environment, environment
 from whitefurnace.errors import CheckError, UsageError
 from whitefurnace.plan import LevelPlan
 from whitefurnace.recipe import IRRADIANCE_SIZE, Chain, chain, tolerance_of
 from whitefurnace.run import Integrated
-from whitefurnace.sphere import Shape
+from whitefurnace.sphere import Shape, source_solid_angles
 
 
 @dataclass(frozen=True)
@@ -248,7 +248,7 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
     if env.coverage is not None:
         # Coverage is light of one channel: the same chain, the same statement.
         grey = np.repeat(env.coverage[..., None], 3, -1)
-        share = float(np.average(env.coverage, weights=_source_weights(env)))
+        share = float(np.average(env.coverage, weights=source_solid_angles(env)))
         as_light = replace(env, texels=grey, coverage=None, statistics={"mean": [share] * 3})
         convolver = Convolver(device, as_light, precision=convolver.precision, seed=seed, progress=progress)
         jobs = chain_jobs(convolver, recipe)
@@ -257,14 +257,6 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
     n = len(jobs)
     return Lighting(tuple(levels[:n]), tuple(levels[n:-1]), levels[-1], sh, sh_error, kept, tuple(coverage[:n]),
                     tuple(coverage[n:]), time.perf_counter() - begin)
-
-
-def _source_weights(env: Environment) -> np.ndarray:
-    """Solid angles of the source's texels, in the shape of its coverage."""
-    assert env.coverage is not None
-    if env.kind == "latlong":
-        return np.broadcast_to(latlong_solid_angles(*env.coverage.shape)[:, None], env.coverage.shape)
-    return np.broadcast_to(cube_solid_angles(env.coverage.shape[1]), env.coverage.shape)
 
 
 def prefilter(source: Any, *, size: int = 256, min_size: int = 16, ndf: str | Model = "ggx",

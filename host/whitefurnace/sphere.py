@@ -11,7 +11,7 @@ import numpy as np
 
 from whitefurnace import plan as planning
 from whitefurnace.catalogue.rule import gauss
-from whitefurnace.environments import cube_solid_angles, latlong_solid_angles
+from whitefurnace.environments import Environment, cube_solid_angles, latlong_solid_angles
 
 BLOCK = 16
 """Sources that `convolve_near` takes or leaves together."""
@@ -87,6 +87,21 @@ def latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
     theta = (index // columns + 0.5) * math.pi / rows
     phi = (index % columns + 0.5) * 2 * math.pi / columns - math.pi
     return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)])
+
+
+def source_directions(env: Environment, index: np.ndarray) -> np.ndarray:
+    """(3, m) of texel centres of an environment in the world, by flat index, its rotation included."""
+    rows, columns = env.texels.shape[-3:-1]
+    d = latlong_centres(rows, columns, index) if env.kind == "latlong" else cube_centres(rows, index)
+    c, s = math.cos(env.rotation), math.sin(env.rotation)
+    return np.stack([c * d[0] - s * d[2], d[1], s * d[0] + c * d[2]])
+
+
+def source_solid_angles(env: Environment) -> np.ndarray:
+    """Steradians of every texel of an environment, in the shape of its texels without the channels."""
+    shape = env.texels.shape[:-1]
+    angles = latlong_solid_angles(*shape)[:, None] if len(shape) == 2 else cube_solid_angles(shape[1])
+    return np.broadcast_to(angles, shape)
 
 
 def grid_tangents(n: int) -> np.ndarray:

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from whitefurnace.environments import Environment, cube_solid_angles, latlong_solid_angles, statistics_of
+from whitefurnace.environments import Environment, statistics_of
 from whitefurnace.errors import UsageError, nearest
-from whitefurnace.sphere import cube_centres, latlong_centres
+from whitefurnace.sphere import source_directions, source_solid_angles
 
 MODES = ("keep", "extract", "clamp=X")
 
@@ -83,7 +83,7 @@ def without_sun(env: Environment, mode: str) -> tuple[Environment, Sun | None]:
     if name == "keep":
         return env, None
     flat = env.texels.reshape(-1, 3)
-    weights = _solid_angles(env)
+    weights = source_solid_angles(env).ravel()
     level = flat.mean(1, dtype=np.float64)
     energy = float(level @ weights)
     if energy <= 0:
@@ -111,7 +111,7 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
                energy: float) -> tuple[Environment, Sun | None]:
     index = np.arange(level.size)
     top = int(level.argmax())
-    cosine = _directions(env, np.array([top]))[:, 0] @ _directions(env, index)
+    cosine = source_directions(env, np.array([top]))[:, 0] @ source_directions(env, index)
     ring = index[(cosine < math.cos(CAP)) & (cosine >= math.cos(RING))]
     around = index[cosine >= math.cos(CAP)]
     sky = float(np.median(level[ring])) if ring.size else 0.0
@@ -125,13 +125,13 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
     if float(level[beyond] @ weights[beyond]) > WIDER * float(level[held] @ weights[held]):
         return _told(env, env.texels, "no sun was found: what stands out about the brightest texel reaches further "
                                       f"than {math.degrees(CAP):g}°, a panel rather than a sun"), None
-    towards = _directions(env, held)
+    towards = source_directions(env, held)
     centre = towards @ (level[held] * weights[held])
     centre /= np.linalg.norm(centre)
     # The sky beside it: what is not the sun, within some texels of its edge.
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
     edge = math.acos(min(1.0, float((centre @ towards).min()))) + BESIDE * texel
-    beside = np.setdiff1d(around[centre @ _directions(env, around) >= math.cos(edge)], held)
+    beside = np.setdiff1d(around[centre @ source_directions(env, around) >= math.cos(edge)], held)
     beside = beside if beside.size else ring
     fill = np.average(flat[beside].astype(np.float64), 0, weights[beside])
     texels = flat.copy()
@@ -156,18 +156,3 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
 def _told(env: Environment, texels: np.ndarray, notice: str) -> Environment:
     found = replace(env, texels=texels, notices=(*env.notices, notice))
     return found if texels is env.texels else replace(found, statistics=statistics_of(found))
-
-
-def _solid_angles(env: Environment) -> np.ndarray:
-    """Of every texel, flat."""
-    if env.kind == "latlong":
-        return np.repeat(latlong_solid_angles(*env.texels.shape[:2]), env.texels.shape[1])
-    return np.tile(cube_solid_angles(env.texels.shape[1]).ravel(), 6)
-
-
-def _directions(env: Environment, index: np.ndarray) -> np.ndarray:
-    """(3, m) of texel centres in the world, the rotation included."""
-    rows, columns = env.texels.shape[-3:-1]
-    d = latlong_centres(rows, columns, index) if env.kind == "latlong" else cube_centres(rows, index)
-    c, s = math.cos(env.rotation), math.sin(env.rotation)
-    return np.stack([c * d[0] - s * d[2], d[1], s * d[0] + c * d[2]])
