@@ -12,6 +12,7 @@ from reference import cube_directions
 from whitefurnace.environments import (
     LAYOUTS,
     Environment,
+    channel_range,
     cube_solid_angles,
     environment,
     latlong_solid_angles,
@@ -281,6 +282,20 @@ def test_statistics_against_plain_sums(kind):
     directions = latlong_directions(*shape[:2]) if kind == "latlong" else cube_directions(shape[1])
     np.testing.assert_allclose(env.statistics["brightest"], directions[at], atol=1e-12)
     assert (env.statistics["height"], env.statistics["width"]) == shape[-3:-1]
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (5, 10), (6, 3, 3)])
+def test_range_by_channel(shape):
+    texels = np.random.default_rng(list(shape)).normal(size=(*shape, 3)).astype(np.float32)
+    least, most = channel_range(texels)
+    flat = texels.reshape(-1, 3).tolist()
+    assert least.tolist() == [min(x[k] for x in flat) for k in range(3)] and least.dtype == np.float32
+    assert most.tolist() == [max(x[k] for x in flat) for k in range(3)]
+
+
+def test_kept_solid_angles_cannot_be_changed():
+    with pytest.raises(ValueError, match="read-only"):
+        cube_solid_angles(4)[0, 0] = 1
 
 
 def test_black_is_good_input():

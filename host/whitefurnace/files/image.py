@@ -264,6 +264,8 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
             band = band[..., order]
         part = out[max(y, begin) - begin : min(stop, end) - begin]
         if kind == "float":
+            if part.shape == out.shape and band.dtype == np.float32 and band.flags.c_contiguous:
+                return band  # the whole image at once: nothing to put together
             part[...] = band
         else:
             decode_srgb(band, part)
