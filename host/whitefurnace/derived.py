@@ -200,3 +200,12 @@ def at_horizon(device: Device, entry: Model, parameters: Mapping[str, float]) ->
 
 def _row(entry: Model, parameters: Mapping[str, float]) -> np.ndarray:
     return np.array([[parameters[p.name]] for p in entry.parameters], np.float64).reshape(-1, 1)
+
+
+def density_at(device: Device, entry: Model, parameters: Mapping[str, float], q: np.ndarray) -> np.ndarray:
+    """D, (n,) float64, at q = |l - r|² where n = v = r: sin²θ_h = q/4. q: (n,) in [0, 2]."""
+    if entry.reference:
+        return np.asarray(entry.reference["D"](np.arcsin(np.sqrt(q / 4)), **parameters), np.float64)
+    numbers = numbers_of(device, entry, _row(entry, parameters))
+    cells = np.concatenate([np.sqrt(1 - q / 4)[None], q[None] / 4, np.repeat(numbers, len(q), 1)])
+    return evaluate(device, "NDF_D", {"ndf": entry}, cells, finest(device))[0].astype(np.float64)

@@ -33,6 +33,8 @@ class Tuning(NamedTuple):
 
     vectors: int  # T: vectors of W lanes a work item
     local_size: int  # work items a group
+    scalar_size: int = 64  # of kernels whose work items are many, small and scalar: a group costs 10 ns on PoCL
+    orbits: int = 4  # vectors of outputs that take the same classes in turn while these are in cache (octahedral.cl)
 
 
 TUNING = {
@@ -40,7 +42,7 @@ TUNING = {
     "cpu8": Tuning(vectors=1, local_size=1),  # 16 registers: a second vector spills
     "cpu4": Tuning(vectors=1, local_size=1),
     "cpu1": Tuning(vectors=1, local_size=16),  # below 16 PoCL's own vectoriser has nothing to join
-    "gpu": Tuning(vectors=2, local_size=128),
+    "gpu": Tuning(vectors=2, local_size=128, scalar_size=128, orbits=1),
     "other": Tuning(vectors=1, local_size=16),
 }
 
@@ -387,8 +389,10 @@ class Device:
 
     `name`, `platform`, `driver` and `version` are the driver's words, `type` is "gpu", "cpu" or "other".
     `vectors` is T, the vectors of W lanes a work item; `local_size` is the work items a group along the first
-    axis; `max_allocation` and `global_memory` are in bytes; `seconds` is the time that kernels have run, up
-    to date after `finish` or `Buffer.read`. WHITEFURNACE_LANES (1, 4, 8 or 16) overrides the lanes.
+    axis, `scalar_size` where items are small and scalar; `orbits` groups of outputs share what `octahedral.cl` reads;
+    `max_allocation` and `global_memory` are in bytes;
+    `seconds` is the time that kernels have run, up to date after `finish` or `Buffer.read`. WHITEFURNACE_LANES
+    (1, 4, 8 or 16) overrides the lanes.
     """
 
     def __init__(self, raw: Any) -> None:
@@ -407,6 +411,8 @@ class Device:
         self.vectors = tuning.vectors
         most = min(int(raw.max_work_group_size), int(raw.max_work_item_sizes[0]))
         self.local_size = min(tuning.local_size, most)
+        self.scalar_size = min(tuning.scalar_size, most)
+        self.orbits = tuning.orbits
         self._alignment = max(int(raw.mem_base_addr_align) // 8, 64)
         self._fp64: bool | None = None
         self._programs: dict[tuple[str, str], Program] = {}

@@ -2,9 +2,10 @@
 against the exact integral and refined where it misses the tolerance."""
 from __future__ import annotations
 
+import contextlib
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,13 +14,16 @@ import numpy as np
 from whitefurnace import plan as planning
 from whitefurnace.catalogue import Model
 from whitefurnace.certificate import statement, texel_errors
-from whitefurnace.convolution import COSINE, EXACT_SHARE, ROUNDING, Convolver, Level, Lobe, Progress, ndf_lobe
+from whitefurnace.convolution import EXACT_SHARE, ROUNDING, Convolver, Level, Progress
 from whitefurnace.device import Device, choose_device
 from whitefurnace.environments import Environment, environment
 from whitefurnace.errors import CheckError, UsageError
+from whitefurnace.fitting import read_mixtures
+from whitefurnace.lobes import COSINE, Lobe, mixture_lobe, ndf_lobe
 from whitefurnace.plan import LevelPlan
-from whitefurnace.recipe import IRRADIANCE_SIZE, Chain, chain, tolerance_of
+from whitefurnace.recipe import CERTIFIED, IRRADIANCE_SIZE, Chain, chain, samples_of, tolerance_of
 from whitefurnace.run import Integrated
+from whitefurnace.samples import Sampler
 from whitefurnace.sphere import Shape, source_solid_angles
 
 
@@ -27,10 +31,12 @@ from whitefurnace.sphere import Shape, source_solid_angles
 class Prefiltered:
     """A specular chain. `values` is a tuple of float32 arrays, (6, s, s, 3) a level in the GL-direct layout, or
     (s, 2 s, 3) as lat-longs; `roughness`, `error`, `worst`, `rmse` are (n,) float64; `evaluations` counts lobe
-    evaluations of the convolution; `seconds` is wall time; `rule` names the method of each level."""
+    evaluations of the convolution; `seconds` is wall time, `timings` what of it went into the "source" (bright texels,
+    grids), the "levels" and the "certificate"; `rule` names the method of each level."""
 
     levels: tuple[Level, ...]
     seconds: float
+    timings: dict[str, float]
 
     @property
     def values(self) -> tuple[np.ndarray, ...]:
@@ -82,66 +88,115 @@ class Job:
 def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) -> list[Job]:
     """The jobs of a specular chain, as cubes, or as lat-longs of twice a face's height."""
     jobs = []
-    for level in planning.plan_chain(recipe, convolver.texel, convolver.share):
-        lobe = (None if level.roughness == 0 else
-                ndf_lobe(convolver.device, recipe.ndf, level.roughness, level.parameters))
-        if lobe and lobe.horizon > lobe.alpha:  # a tail heavier than GGX's
-            grid = max(level.grid, planning.grid_size(lobe.alpha, recipe.tolerance, lobe.horizon))
-            level = replace(level, grid=grid)
+    planned = planning.plan_chain(recipe, convolver.texel, convolver.share, convolver.texels.centred)
+    mixtures = read_mixtures(convolver.device, recipe) if recipe.fit else [None] * len(planned)
+    for level, mixture in zip(planned, mixtures, strict=True):
+        lobe = None
+        if mixture:
+            lobe = mixture_lobe(convolver.device, recipe.ndf, mixture, recipe.parameters)
+        elif level.roughness > 0:
+            lobe = ndf_lobe(convolver.device, recipe.ndf, level.roughness, level.parameters)
+        if lobe and level.grid and (mixture or lobe.horizon > lobe.alpha):  # other than GGX's own
+            grid = planning.grid_size(lobe.alpha, recipe.tolerance, max(lobe.horizon, lobe.alpha))
+            level = replace(level, grid=max(level.grid, grid), cuts=max(level.cuts, planning.cuts_for(
+                convolver.texel, lobe.alpha, recipe.tolerance, convolver.share, convolver.texels.centred)))
         jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size)))
     return jobs
 
 
-def irradiance_job(convolver: Convolver, size: int, tolerance: float) -> Job:
+def irradiance_job(convolver: Convolver, size: int, tolerance: float, samples: int | None = None) -> Job:
     """The job of the irradiance cube."""
-    cuts = planning.cuts_for(convolver.texel, 1.0, tolerance, convolver.share)
-    return Job(LevelPlan(size, 1.0, {}, planning.grid_size(1.0, tolerance), cuts), COSINE, Shape(False, size))
+    cuts = planning.cuts_for(convolver.texel, 1.0, tolerance, convolver.share, convolver.texels.centred)
+    grid = 0 if samples else planning.grid_size(1.0, tolerance)
+    return Job(LevelPlan(size, 1.0, {}, grid, cuts, samples or 0), COSINE, Shape(False, size))
 
 
-def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float) -> list[Level]:
+class Clock:
+    """Wall seconds by what they were spent on: "source", "levels", "certificate"."""
+
+    def __init__(self) -> None:
+        self.seconds = {"source": 0.0, "levels": 0.0, "certificate": 0.0}
+
+    @contextlib.contextmanager
+    def __call__(self, what: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[what] += time.perf_counter() - begin
+
+
+def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float, *, certify: int = CERTIFIED,
+             clock: Clock | None = None) -> list[Level]:
     """Makes, certifies and where needed refines every level, in the order of `jobs`.
 
     The exact values come first: how finely texels must be cut for them is how finely the grids need them too.
-    Raises CheckError when a level misses the tolerance and finer grids do not help.
+    certify: uniform texels of each certificate, 0 for none: then nothing is stated (NaN) and nothing refined.
+    Raises CheckError when a level misses the tolerance and finer grids do not help; samples are as many as were asked
+    for, and their levels state what they leave.
     """
+    clock = clock or Clock()
     begin = time.perf_counter()
-    samples = [convolver.sample(job.shape) for job in jobs]
-    jobs, references, doubts = _references(convolver, jobs, samples, tolerance)
-    if any(job.lobe for job in jobs):
-        convolver.prepare(max(job.plan.grid for job in jobs), max(job.plan.cuts for job in jobs if job.lobe))
+    with clock("certificate"):
+        samples = [convolver.sample(job.shape, certify) for job in jobs] if certify else []
+        jobs, references, doubts = (_references(convolver, jobs, samples, tolerance) if certify else
+                                    (jobs, [np.empty(0)] * len(jobs), [0.0] * len(jobs)))
+    with clock("source"):
+        sampler = _sampler(convolver) if any(job.plan.samples for job in jobs) else None
+        if any(job.plan.grid for job in jobs):
+            convolver.prepare(max(job.plan.grid for job in jobs), max(job.plan.cuts for job in jobs if job.plan.grid))
+            convolver.device.finish()
     common = (time.perf_counter() - begin) / len(jobs)
-    work = [planning.pairs_of(job.shape.count, max(job.plan.grid, 8), job.lobe.alpha if job.lobe else 1.0,
-                              job.lobe.horizon if job.lobe else 1.0)
-            for job in jobs]
+    work = [job.shape.count * (job.plan.samples or 1) if not (job.lobe and job.plan.grid) else
+            planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha, job.lobe.horizon) for job in jobs]
     levels = []
     for k, job in enumerate(jobs):
         begin = time.perf_counter()
         share = tuple(EXACT_SHARE + (1 - EXACT_SHARE) * sum(work[:m]) / sum(work) for m in (k, k + 1))
-        level = _stated(convolver, job, _make(convolver, job, tolerance, share), samples[k], references[k], doubts[k])
         before, stuck = math.inf, 0
-        while not level.error <= tolerance:  # NaN too
-            finer = planning.refined(job.plan) if job.lobe else None
+        while True:
+            with clock("levels"):
+                texels = _make(convolver, job, tolerance, share, sampler)
+            if not certify:
+                level = _level(convolver, job, texels, (math.nan, math.nan, math.nan))
+                break
+            with clock("certificate"):
+                level = _stated(convolver, job, texels, samples[k], references[k], doubts[k])
+            if level.error <= tolerance or job.plan.samples:
+                break
+            missed = level.error / tolerance  # NaN too
+            finer = planning.refined(job.plan, missed, job.lobe.horizon) if job.lobe else None
             stuck = stuck + 1 if not level.error <= 0.9 * before else 0
             if finer is None or stuck == 2:
                 what = "mean" if job.lobe is None else job.lobe.name
                 raise CheckError(f"level {what} of {'×'.join(map(str, job.shape.dims))} texels has an error of "
                                  f"{level.error:.2g}, over the tolerance {tolerance:g}, and finer grids do not help")
             job, before = replace(job, plan=finer), level.error
-            texels = _make(convolver, job, tolerance, share)
-            level = _stated(convolver, job, texels, samples[k], references[k], doubts[k])
         levels.append(replace(level, seconds=time.perf_counter() - begin + common))
     return levels
 
 
-def _make(convolver: Convolver, job: Job, tolerance: float, share: tuple[float, ...]) -> np.ndarray:
+def _sampler(convolver: Convolver) -> Sampler:
+    return Sampler(convolver.overlaps, convolver.precision, convolver.progress)
+
+
+def _make(convolver: Convolver, job: Job, tolerance: float, share: tuple[float, ...],
+          sampler: Sampler | None = None) -> np.ndarray:
     if job.lobe is None:
         return convolver.means(job.shape)
+    if sampler and job.plan.samples:
+        return sampler.level(job.lobe, job.shape, job.plan.samples, share)
     return convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance, share)
 
 
-PROBES = 32
+PROBES = 16
 """Texels on which a reference is checked against itself with twice the nodes: the darkest, where a bright panel
 at the horizon shows most."""
+
+COARSE = {"sharp": 2.0, "rough": 2.2}
+"""How much finer than its own a grid is that may stand for all texels in a level's reference: 2^6.5 = 90 times less
+error where the lobe's width decides, 2.2² = 5 times where its kink does."""
+
+COARSE_GRID = 512
+"""Nodes an edge at most of such a grid: of sharper lobes texels are summed, near their direction if need be."""
 
 
 def _references(convolver: Convolver, jobs: Sequence[Job], samples: Sequence[tuple[np.ndarray, np.ndarray]],
@@ -149,40 +204,76 @@ def _references(convolver: Convolver, jobs: Sequence[Job], samples: Sequence[tup
     """Jobs with the cuts their texels need, the exact values of each one's sample (m, 3), and what these may still
     be off by.
 
-    For rough lobes the nodes are doubled until the values change by less than a tenth of the tolerance on the
-    PROBES darkest texels; the last change is the doubt. Lobes with the same cuts share one pass over the source.
+    A lobe is integrated over every texel, or over a much finer grid than its level where that has half as many nodes.
+    The grid is checked on the PROBES darkest texels against every texel, cut twice as finely where the lobe has a kink
+    that they would not show; the change there is the doubt. While it is more than a tenth of the tolerance, texels take
+    the grid's place, and then twice the nodes. Lobes with the same cuts share one pass over the source.
     """
     jobs = list(jobs)
     index = [np.concatenate(sample) for sample in samples]
+    cut = [job.plan.cuts for job in jobs]  # nodes a texel edge of each reference
     references: list[np.ndarray] = [np.empty(0)] * len(jobs)
     doubts = [0.0] * len(jobs)
+    grids = [0] * len(jobs)
     for k, job in enumerate(jobs):
         if job.lobe is None:
             references[k] = convolver.exact_means(job.shape, index[k])
+        elif job.plan.grid:
+            n = planning.nodes_for(COARSE["rough" if _kinked(job) else "sharp"] * job.plan.grid)
+            grids[k] = n if n <= COARSE_GRID and 2 * 6 * n * n <= convolver.texels.nodes(job.plan.cuts) else 0
+    if any(grids):
+        convolver.prepare(max(*grids, *(job.plan.grid for job in jobs)), max(job.plan.cuts for job in jobs if job.lobe))
     todo = [k for k, job in enumerate(jobs) if job.lobe]
     while todo:
-        for cuts in sorted({jobs[k].plan.cuts for k in todo}):
-            group = [k for k in todo if jobs[k].plan.cuts == cuts]
+        for k in todo:
+            if grids[k]:
+                directions = jobs[k].shape.directions(index[k])
+                references[k] = convolver.on_grid(_lobe(jobs[k]), directions, grids[k], tolerance)
+        for cuts in sorted({cut[k] for k in todo if not grids[k]}):
+            group = [k for k in todo if not grids[k] and cut[k] == cuts]
             for k, values in zip(group, _exact(convolver, jobs, group, index, cuts, tolerance), strict=True):
                 references[k] = values
-                doubts[k] = planning.cuts_error(convolver.texel, _lobe(jobs[k]).alpha, cuts)
-        todo = [k for k in todo if _lobe(jobs[k]).horizon > planning.SHARP_ENOUGH and not convolver.constant]
+                doubts[k] = planning.cuts_error(convolver.texel, _lobe(jobs[k]).alpha, cuts,
+                                                convolver.texels.centred)
+        todo = [k for k in todo if (_kinked(jobs[k]) or grids[k]) and not convolver.constant]
         again = []
-        for cuts in sorted({jobs[k].plan.cuts for k in todo}):
-            group = [k for k in todo if jobs[k].plan.cuts == cuts]
+        seen = {k: _seen(convolver, jobs[k], cut[k], grids[k]) for k in todo}
+        finest = {k: cut[k] * (1 if seen[k] else 2) for k in todo}
+        for cuts in sorted(set(finest.values())):
+            group = [k for k in todo if finest[k] == cuts]
             dark = {k: np.argsort(references[k].min(1), kind="stable")[:PROBES] for k in group}
             probes = {k: index[k][dark[k]] for k in group}
-            finer = _exact(convolver, jobs, group, probes, 2 * cuts, tolerance)
+            finer = _exact(convolver, jobs, group, probes, cuts, tolerance)
             for k, values in zip(group, finer, strict=True):
                 mean = convolver.mean * convolver.scale
-                doubts[k] = float(texel_errors(references[k][dark[k]], values, mean).max())
+                doubts[k] = float(texel_errors(references[k][dark[k]], values, mean).max()) / (seen[k] or 1.0)
                 # On small images more nodes cost nothing: there the reference is made exact, not just good enough.
-                cheap = convolver.nodes(2 * cuts) <= 4 * planning.NODES_A_BAND
-                if doubts[k] > tolerance / (100 if cheap else 10) and 2 * cuts <= planning.MOST_CUTS:
-                    jobs[k] = replace(jobs[k], plan=replace(jobs[k].plan, cuts=2 * cuts))
+                cheap = convolver.texels.nodes(cuts) <= 4 * planning.NODES_A_BAND
+                if doubts[k] <= tolerance / (100 if cheap else 10):
+                    continue
+                if grids[k]:
+                    grids[k] = 0
                     again.append(k)
+                elif cuts <= planning.MOST_CUTS:
+                    cut[k] = cuts
+                    again.append(k)
+                    if doubts[k] > tolerance / 10:  # the level needs them too
+                        jobs[k] = replace(jobs[k], plan=replace(jobs[k].plan, cuts=cuts))
         todo = again
     return jobs, references, doubts
+
+
+def _seen(convolver: Convolver, job: Job, cuts: int, grid: int) -> float:
+    """Of what a reference grid errs by, the part that texels show that are cut in `cuts`, 0 where that is too
+    little. Where a lobe sets, nodes h apart err by h², texels as well as the grid."""
+    if not _kinked(job):
+        return 1.0
+    ratio = convolver.texel / cuts / planning.spacing(grid) if grid else 1.0
+    return 1 - ratio**2 if ratio**2 <= 0.55 else 0.0
+
+
+def _kinked(job: Job) -> bool:
+    return _lobe(job).horizon > planning.SHARP_ENOUGH
 
 
 def _lobe(job: Job) -> Lobe:
@@ -206,13 +297,19 @@ def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np
     rounding = 0.0 if mean == 0 else ROUNDING[64 if job.lobe is None else convolver.precision]
     if mean > 0 and not convolver.constant:
         rounding += doubt
+    return _level(convolver, job, texels, (error + rounding, worst + rounding, rmse))
+
+
+def _level(convolver: Convolver, job: Job, texels: np.ndarray, stated: tuple[float, float, float]) -> Level:
     method, pairs = "texel-mean", 0
-    if job.lobe:
+    if job.plan.samples:
+        method, pairs = f"samples-{job.plan.samples}", job.shape.count * job.plan.samples
+    elif job.lobe:
         method = f"anterpolated-{job.plan.grid}"
         pairs = planning.pairs_of(job.shape.count, job.plan.grid, job.lobe.alpha, job.lobe.horizon)
-    scaled = (texels * (1 / convolver.scale)).astype(np.float32)  # a power of two: exact
-    return Level(scaled, job.plan.roughness, error + rounding, worst + rounding, rmse, method, job.plan.grid, pairs,
-                 seconds=0.0)
+    # Back to the image's own scale, a power of two: exact.
+    scaled = texels if convolver.scale == 1 else texels * np.float32(1 / convolver.scale)
+    return Level(scaled, job.plan.roughness, *stated, method, job.plan.grid, pairs, seconds=0.0)
 
 
 @dataclass(frozen=True)
@@ -239,8 +336,8 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
                           progress=progress)
     jobs = chain_jobs(convolver, recipe)
     wide = chain_jobs(convolver, recipe, latlong=True) if latlong else []
-    everything = [*jobs, *wide, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance)]
-    levels = run_jobs(convolver, everything, recipe.tolerance)
+    everything = [*jobs, *wide, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance, recipe.samples)]
+    levels = run_jobs(convolver, everything, recipe.tolerance, certify=recipe.certify)
     sh, sh_error = convolver.harmonics()
     kept = tuple(job.shape.mean(level.texels) / convolver.mean - 1 if convolver.mean > 0 else 0.0
                  for job, level in zip(jobs, levels[:len(jobs)], strict=True))
@@ -253,40 +350,51 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
         convolver = Convolver(device, as_light, precision=convolver.precision, seed=seed, progress=progress)
         jobs = chain_jobs(convolver, recipe)
         wide = chain_jobs(convolver, recipe, latlong=True) if latlong else []
-        coverage = run_jobs(convolver, [*jobs, *wide], recipe.tolerance)
+        coverage = run_jobs(convolver, [*jobs, *wide], recipe.tolerance, certify=recipe.certify)
     n = len(jobs)
     return Lighting(tuple(levels[:n]), tuple(levels[n:-1]), levels[-1], sh, sh_error, kept, tuple(coverage[:n]),
                     tuple(coverage[n:]), time.perf_counter() - begin)
 
 
-def prefilter(source: Any, *, size: int = 256, min_size: int = 16, ndf: str | Model = "ggx",
-              tolerance: float | None = None, quality: str | None = None, rotate: float = 0.0, exposure: float = 0.0,
-              nonfinite: str = "refuse", latlong: bool = False, device: Device | str | None = None) -> Prefiltered:
+def prefilter(source: Any, *, size: int = 256, min_size: int | None = None, ndf: str | Model = "ggx",
+              tolerance: float | None = None, quality: str | None = None, samples: int | None = None,
+              levels: int | None = None, fit: str | None = None, certify: int = CERTIFIED, rotate: float = 0.0,
+              exposure: float = 0.0, nonfinite: str = "refuse", latlong: bool = False,
+              device: Device | str | None = None) -> Prefiltered:
     """The specular chain of an environment (a path, an array or an `environment`).
 
     size, min_size: powers of two, texels a face edge of the first and last level. ndf: an isotropic NDF.
-    tolerance: bound on `error` of every level, default 1e-3; or quality draft, normal, reference. rotate:
-    degrees about +Y; exposure: stops; nonfinite: "refuse" or "zero". latlong: levels as lat-long images of
-    2·size rows. Raises the errors of `environment`, UsageError, UnsupportedError, CheckError, DeviceError.
+    tolerance: bound on `error` of every level, default 1e-3; or quality draft, normal, reference; or samples, 1 to
+    65536 a texel of filtered importance sampling, whatever `error` that leaves. levels: how many; fit: "read" for
+    levels that read best between them. certify: uniform texels of each level's certificate, 299 or more; 0 for none,
+    then `error`, `worst` and `rmse` are NaN and nothing is refined. rotate: degrees about +Y; exposure: stops;
+    nonfinite: "refuse" or "zero". latlong: levels as lat-long images of 2·size rows. Raises the errors of
+    `environment`, UsageError, UnsupportedError, CheckError, DeviceError.
     """
     begin = time.perf_counter()
-    recipe = chain(ndf=ndf, size=size, min_size=min_size, tolerance=tolerance, quality=quality)
+    recipe = chain(ndf=ndf, size=size, min_size=min_size, tolerance=tolerance, quality=quality, samples=samples,
+                   levels=levels, fit=fit, certify=certify)
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
-    convolver = Convolver(_device(device), env, precision=planning.precision_for(recipe.tolerance))
-    levels = run_jobs(convolver, chain_jobs(convolver, recipe, latlong=latlong), recipe.tolerance)
-    return Prefiltered(tuple(levels), time.perf_counter() - begin)
+    clock = Clock()
+    with clock("source"):
+        convolver = Convolver(_device(device), env, precision=planning.precision_for(recipe.tolerance))
+    made = run_jobs(convolver, chain_jobs(convolver, recipe, latlong=latlong), recipe.tolerance, certify=recipe.certify,
+                    clock=clock)
+    return Prefiltered(tuple(made), time.perf_counter() - begin, clock.seconds)
 
 
-def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | None = None, rotate: float = 0.0,
-               exposure: float = 0.0, nonfinite: str = "refuse", device: Device | str | None = None) -> Certified:
+def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | None = None,
+               samples: int | None = None, rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse",
+               device: Device | str | None = None) -> Certified:
     """E/π as a cube (6, size, size, 3) float32: a constant environment of 1 gives 1. Raises as `prefilter`."""
     if not 1 <= size <= 1024:
         raise UsageError(f"irradiance size {size} is outside [1, 1024]")
     begin = time.perf_counter()
+    count = samples_of(samples, tolerance)
     bound = tolerance_of(tolerance, None)
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     convolver = Convolver(_device(device), env, precision=planning.precision_for(bound))
-    level = run_jobs(convolver, [irradiance_job(convolver, size, bound)], bound)[0]
+    level = run_jobs(convolver, [irradiance_job(convolver, size, bound, count)], bound)[0]
     return Certified(level.texels, level.error, level.pairs, time.perf_counter() - begin, level.method,
                      worst=level.worst, rmse=level.rmse)
 
@@ -299,7 +407,7 @@ def harmonics(source: Any, *, rotate: float = 0.0, exposure: float = 0.0, nonfin
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     convolver = Convolver(_device(device), env)
     values, error = convolver.harmonics()
-    return Certified(values, error, convolver.faces * convolver.rows * convolver.columns,
+    return Certified(values, error, env.texels.size // 3,
                      time.perf_counter() - begin, "texel-nodes", worst=error, rmse=error)
 
 

@@ -178,6 +178,11 @@ def integration(integral: Integral, slots: Mapping[str, Model], area_terms: int 
                       f"integrand/{integral.name}.clh", "integrate.cl" if isotropic else "stretched.cl"])
 
 
+def closed(file: str, slots: Mapping[str, Model]) -> Source:
+    """The program of an integral that has a kernel of its own for these models (`catalogue.registry.CLOSED`)."""
+    return _assemble(["real.clh", ("bindings", _bindings(slots)), *_models(slots, 0), file])
+
+
 def area(ndf: Model) -> Source:
     """The program that makes the table of Smith's area."""
     return _assemble(["real.clh", ("bindings", "#define POLAR\n" + _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0),
@@ -268,14 +273,37 @@ def frame_nodes(kind: str) -> Source:
 def convolution(ndf: Model | None) -> Source:
     """The zonal convolution with the lobe of an NDF, or with the cosine lobe of irradiance for None."""
     if ndf is None:
-        return _assemble(["real.clh", "lobe_cosine.clh", "prefilter.cl"])
-    return _assemble(["real.clh", ("bindings", _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0), "lobe.clh",
-                      "prefilter.cl"])
+        return _assemble(["real.clh", "window.clh", "lobe_cosine.clh", "prefilter.cl"])
+    return _assemble(["real.clh", ("bindings", _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0), "window.clh",
+                      "lobe.clh", "prefilter.cl"])
+
+
+def near_texels(kind: str, ndf: Model) -> Source:
+    """The exact integral of a narrow lobe over the texels near its direction, of a source of the kind "latlong" or
+    "cube"."""
+    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", ("bindings", _bindings({"ndf": ndf})),
+                      *_models({"ndf": ndf}, 0), "window.clh", "lobe.clh", "exact.cl"])
+
+
+def octahedral() -> Source:
+    """The zonal convolution by the symmetries of the cube, of any lobe."""
+    return _assemble(["real.clh", "sphere.clh", "window.clh", "lobe_table.clh", "octahedral.cl"])
+
+
+def interpolation() -> Source:
+    """Levels from their values at the nodes of a grid."""
+    return _assemble(["real.clh", "sphere.clh", "grid.clh", "interpolate.cl"])
 
 
 def texels(kind: str) -> Source:
     """Nodes and anterpolation of a source of the kind "latlong" or "cube", and spherical harmonics."""
-    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", "anterpolate.cl", "harmonics.cl"])
+    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", "grid.clh", "anterpolate.cl",
+                      "harmonics.cl"])
+
+
+def samples() -> Source:
+    """The pyramid of a cube, and filtered importance sampling of it."""
+    return _assemble(["real.clh", "sphere.clh", "pyramid.cl", "samples.cl"])
 
 
 def overlap() -> Source:
@@ -286,3 +314,8 @@ def overlap() -> Source:
 def demo() -> Source:
     """The built-in environment."""
     return _assemble(["real.clh", "demo.cl"])
+
+
+def yardstick() -> Source:
+    """What a device can do at most: multiply-adds and memory."""
+    return _assemble(["real.clh", "yardstick.cl"])
