@@ -17,7 +17,11 @@ from whitefurnace.errors import UnsupportedError, UsageError, nearest
 
 QUALITIES = {"draft": 1e-2, "normal": 1e-3, "reference": 2e-5}
 SIZE_RANGE = (1, 2048)
+MIN_SIZE = 16
+LEVELS_RANGE = (1, 32)
+FITS = ("read",)
 TOLERANCE_RANGE = (1e-5, 0.5)
+SAMPLES_RANGE = (1, 65536)
 IRRADIANCE_SIZE = 32
 DFG_SIZE = 128
 
@@ -109,6 +113,19 @@ def tolerance_of(tolerance: float | None, quality: str | None) -> float:
     return float(tolerance)
 
 
+def samples_of(samples: int | None, tolerance: float | None, quality: str | None = None) -> int | None:
+    """The samples a texel that `--samples` asks for, None for none; they stand in the place of a tolerance."""
+    if samples is None:
+        return None
+    for what, value in (("tolerance", tolerance), ("quality", quality)):
+        if value is not None:
+            raise UsageError(f"give samples or a {what}, not both")
+    low, high = SAMPLES_RANGE
+    if not (is_number(samples) and low <= samples <= high and samples == int(samples)):
+        raise UsageError(f"samples {samples!r} is not a whole number in [{low}, {high}]")
+    return int(samples)
+
+
 def _power_of_two(value: int, what: str) -> int:
     low, high = SIZE_RANGE
     if not (low <= value <= high and value & (value - 1) == 0):
@@ -118,23 +135,49 @@ def _power_of_two(value: int, what: str) -> int:
 
 def roughness_of_level(k: int, levels: int) -> float:
     """Perceptual roughness of level k of n: r = 1 - √(1 - k/(n - 1)), the mapping of Filament and three.js."""
-    return 0.0 if levels == 1 else 1 - math.sqrt(1 - k / (levels - 1))
+    return roughness_of_lod(k, levels)
+
+
+def roughness_of_lod(lod: float, levels: int) -> float:
+    """Perceptual roughness that engines read at a lod in [0, levels - 1], between levels too."""
+    return 0.0 if levels == 1 else 1 - math.sqrt(max(1 - lod / (levels - 1), 0.0))
+
+
+def lod_of_roughness(roughness: float, levels: int) -> float:
+    """Its inverse: lod = (levels - 1) r (2 - r)."""
+    return (levels - 1) * roughness * (2 - roughness)
+
+
+CERTIFIED = 299
+"""Uniform texels of a certificate: the largest of 299 errors bounds the 99th percentile at 95 % confidence, since
+.99^299 = .0495 (order statistic)."""
+
+CERTIFY_RANGE = (CERTIFIED, 1 << 20)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A specular chain: sizes halve from `size` to `min_size`, roughness follows the default mapping."""
+    """A specular chain: sizes halve from `size` to `min_size`, roughness follows the default mapping.
+
+    `count` levels, None for those that halving gives; sizes past `min_size` stay there. `fit` "read" bakes mixtures
+    of lobes that read best between levels (fitting.py), None each level's own lobe. `samples` is how many a texel of
+    filtered importance sampling takes, on every level r > 0 and in irradiance; None: what the tolerance needs.
+    """
 
     ndf: Chosen
     size: int
     min_size: int
     tolerance: float
+    count: int | None = None
+    fit: str | None = None
+    samples: int | None = None
+    certify: int = CERTIFIED
 
     @property
     def levels(self) -> tuple[tuple[int, float], ...]:
         """(size, perceptual roughness) of each level."""
-        n = int(math.log2(self.size // self.min_size)) + 1
-        return tuple((self.size >> k, roughness_of_level(k, n)) for k in range(n))
+        n = self.count or int(math.log2(self.size // self.min_size)) + 1
+        return tuple((max(self.size >> k, self.min_size), roughness_of_level(k, n)) for k in range(n))
 
     def parameters(self, roughness: float) -> dict[str, float]:
         """The NDF's parameters at a perceptual roughness."""
@@ -145,15 +188,38 @@ class Chain:
 
     def canonical(self) -> dict[str, Any]:
         return {"ndf": self.ndf.canonical(), "size": self.size, "min_size": self.min_size,
-                "tolerance": self.tolerance, "roughness": [r for _, r in self.levels]}
+                **({"tolerance": self.tolerance} if self.samples is None else {"samples": self.samples}),
+                "roughness": [r for _, r in self.levels], "fit": self.fit, "certify": self.certify}
 
 
-def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int = 16, tolerance: float | None = None,
-          quality: str | None = None) -> Chain:
+def _smallest(size: int, min_size: int | None, levels: int | None) -> int:
+    """Face edge of the last level: as given, what `levels` halvings leave, or MIN_SIZE. Raises UsageError."""
+    if levels is None:
+        return MIN_SIZE if min_size is None else min_size
+    low, high = LEVELS_RANGE
+    if not (is_number(levels) and low <= levels <= high and levels == int(levels)):
+        raise UsageError(f"levels {levels!r} is not a whole number in [{low}, {high}]")
+    halvings = int(math.log2(size)) + 1
+    if min_size is None:
+        if levels > halvings:
+            raise UsageError(f"levels {levels} is outside [1, {halvings}]: from {size}² each level halves, down to 1²; "
+                             f"with a min-size too, the last levels keep that size")
+        return size >> (levels - 1)
+    if min_size <= size and size >> (levels - 1) > min_size:
+        raise UsageError(f"levels {levels} from {size}² end at {size >> (levels - 1)}², not at min-size {min_size}; "
+                         f"give one of the two, or at least {int(math.log2(size // min_size)) + 1} levels")
+    return min_size
+
+
+def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int | None = None, tolerance: float | None = None,
+          quality: str | None = None, levels: int | None = None, fit: str | None = None,
+          samples: int | None = None, certify: int = CERTIFIED) -> Chain:
     """A validated specular chain.
 
-    Raises UsageError for a size that is no power of two, a `min_size` over `size`, a bad tolerance or name;
-    UnsupportedError for an NDF that cannot be prefiltered (anisotropic, or without a roughness).
+    `min_size` is 16, or with `levels` what as many halvings leave; with both, sizes halve to `min_size` and stay.
+    Raises UsageError for a size that is no power of two, a `min_size` over `size`, levels that do not fit, a bad
+    tolerance or name, samples out of range or beside one of these; UnsupportedError for an NDF that cannot be
+    prefiltered (anisotropic, or without a roughness).
     """
     choice = chosen("ndf", ndf)
     if not choice.model.isotropic:
@@ -172,7 +238,17 @@ def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int = 16, tole
     if missing:
         raise UsageError(f"ndf {choice.model.name}: {', '.join(missing)} must be given, as "
                          f"{choice.model.name}:{missing[0]}=VALUE")
-    size, min_size = _power_of_two(size, "size"), _power_of_two(min_size, "min-size")
-    if min_size > size:
-        raise UsageError(f"min-size {min_size} is larger than size {size}")
-    return Chain(choice, size, min_size, tolerance_of(tolerance, quality))
+    if fit is not None and fit not in FITS:
+        raise UsageError(f"unknown fit {fit!r}{nearest(fit, FITS)}")
+    size = _power_of_two(size, "size")
+    given = None if min_size is None else _power_of_two(min_size, "min-size")
+    smallest = _smallest(size, given, levels)
+    if smallest > size:
+        raise UsageError(f"min-size {smallest} is larger than size {size}")
+    count = samples_of(samples, tolerance, quality)
+    low, high = CERTIFY_RANGE
+    if certify != 0 and not (is_number(certify) and low <= certify <= high and certify == int(certify)):
+        raise UsageError(f"certify {certify!r} is not a whole number in [{low}, {high}]: {low} texels are the fewest "
+                         "that bound 99 % of a level at 95 % confidence")
+    return Chain(choice, size, smallest, tolerance_of(tolerance, quality), None if levels is None else int(levels), fit,
+                 count, int(certify))
