@@ -8,23 +8,25 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from whitefurnace import source
-from whitefurnace.catalogue import INTEGRALS, Model, model
+from whitefurnace.catalogue import INTEGRALS, model
 from whitefurnace.device import Device, choose_device
 from whitefurnace.engines import Engine, engines
 from whitefurnace.environments import Environment, environment
-from whitefurnace.errors import FileError, UsageError
+from whitefurnace.errors import DeviceError, FileError, UsageError
 from whitefurnace.files import Transaction, digest_file, read_manifest, write_exr, write_manifest, write_npz
 from whitefurnace.lighting import Lighting, light
 from whitefurnace.plan import LevelPlan, plan_chain
-from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain
-from whitefurnace.run import Integrated, dfg
+from whitefurnace.reading import Reader, compared
+from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, Chosen, chain
+from whitefurnace.run import Integrated, dfg, own_kernel_of
 from whitefurnace.suns import Sun, sun_mode, without_sun
 from whitefurnace.version import VERSION
 
@@ -75,6 +77,8 @@ class Baked:
     notices: tuple[str, ...]
     levels: tuple[dict[str, Any], ...] = ()
     seconds: float = 0.0
+    as_read: tuple[dict[str, Any], ...] = ()
+    """What an engine shows of the chain (reading.AsRead.data): of this one, or in a plan of what could be had too."""
 
 
 @dataclass(frozen=True)
@@ -91,11 +95,12 @@ class Order:
     nonfinite: str
     sun: str
     force: bool
+    as_read: bool = False
 
 
 def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str = "raw", rotate: float = 0.0,
           exposure: float = 0.0, nonfinite: str = "refuse", sun: str = "keep", force: bool = False,
-          **options: Any) -> Order:
+          as_read: bool = False, **options: Any) -> Order:
     """A validated order; `options` are those of `recipe.chain`. Raises UsageError, UnsupportedError."""
     if not sources:
         raise UsageError("no environment was given")
@@ -116,8 +121,10 @@ def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str =
         if name in ("", ".", "..") or "/" in name or "\\" in name:
             raise UsageError(f"{name!r} cannot name an output")
     sun_mode(sun)
+    if options.get("certify") == 0:
+        raise UsageError("certify 0: what is written states its error; give 299 or more texels")
     return Order(tuple(names), tuple(sources), Path(output), engines(for_), chain(**options), float(rotate),
-                 float(exposure), nonfinite, sun, force)
+                 float(exposure), nonfinite, sun, force, bool(as_read) or options.get("fit") is not None)
 
 
 def _is_demo(item: Any) -> bool:
@@ -130,9 +137,11 @@ def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str |
          **options: Any) -> list[Baked]:
     """Bakes environments (a path, an array, an `environment`, or a list of them; `demo` is built in) into `output`.
 
-    options: for_ ("raw,exr"), size, min_size, ndf, tolerance or quality, rotate (degrees), exposure (stops), nonfinite
-    ("refuse", "zero"), sun ("keep", "extract", "clamp=X"), force. Files go to `output/ENGINE/STEM…`;
-    `output/STEM.json`, written last, proves the rest whole. An environment whose manifest has the same key is skipped.
+    options: for_ ("raw,exr"), size, min_size, ndf, tolerance, quality or samples, rotate (degrees), exposure (stops),
+    nonfinite ("refuse", "zero"), sun ("keep", "extract", "clamp=X"), certify (texels of each level's statement),
+    levels, fit ("read"), as_read (measures what an engine will show, as fit "read" does too and a plan always), force.
+    Files go to `output/ENGINE/STEM…`; `output/STEM.json`, written last, proves the rest whole. An environment whose
+    manifest has the same key is skipped.
     Raises UsageError, FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an
     environment that fails.
     """
@@ -163,7 +172,7 @@ def _bake_one(request: Order, k: int, device: Device | str | None, dry_run: bool
                       nonfinite=request.nonfinite)  # type: ignore[arg-type]
     env, sun = without_sun(env, request.sun)
     recipe = _canonical(request, env)
-    key = _key(env, recipe, request.recipe.ndf.model)
+    key = _key(env, recipe, request.recipe.ndf)
     targets = _targets(request, name)
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
     planned = plan_chain(request.recipe, texel)
@@ -178,7 +187,9 @@ def _bake_one(request: Order, k: int, device: Device | str | None, dry_run: bool
     known = [m for m in (there, _manifest_at(Transaction.staging(path), name)) if m]
     _check_ownership([*files, path], known, request, path)
     if dry_run:
-        return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, env.notices)
+        read, notices = _would_read(request, env, device, on)
+        return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, (*env.notices, *notices),
+                     as_read=read)
     folders = sorted({request.output, *(file.parent for file in files)})
     made = [folder for folder in folders if not folder.exists()]
     try:
@@ -201,8 +212,12 @@ def _make(request: Order, k: int, env: Environment, sun: Sun | None, recipe: dic
     on = on or choose_device(device if isinstance(device, str) else None)
     tell = (lambda what, share: progress(name, what, share)) if progress else None
     lit = light(on, env, request.recipe, latlong=any(e.latlong for e in request.engines), seed=key, progress=tell)
-    table = dfg(DFG_SIZE, ndf=request.recipe.ndf, tolerance=DFG_TOLERANCE, device=on)
+    table = _table(on, _Held.of(request.recipe.ndf))
     manifest = _manifest(name, env, sun, recipe, key, on, lit, table)
+    if request.as_read:
+        read = Reader(on, env, request.recipe).as_read(request.recipe, [level.texels for level in lit.levels],
+                                                       [level.error for level in lit.levels])
+        manifest["as_read"] = read.data()
     with Transaction() as transaction:
         digests = {}
         provenance = {"version": VERSION, "key": key, "source": env.digest,
@@ -224,7 +239,20 @@ def _make(request: Order, k: int, env: Environment, sun: Sun | None, recipe: dic
     rows = tuple({**row, "seconds": s} for row, s in zip(manifest["levels"], seconds, strict=True))
     targets = _targets(request, name)
     return Baked(name, "done", tuple(t.path for t in targets), manifest, planned, tuple(t.nbytes for t in targets),
-                 (*env.notices, *table.notices), rows, time.perf_counter() - begin)
+                 (*env.notices, *table.notices), rows, time.perf_counter() - begin,
+                 (manifest["as_read"],) if request.as_read else ())
+
+
+def _would_read(request: Order, env: Environment, device: Device | str | None,
+                on: Device | None) -> tuple[tuple[dict[str, Any], ...], tuple[str, ...]]:
+    """What engines would show of the planned chain and of others, and notices: a plan needs no device for the rest."""
+    try:
+        on = on or choose_device(device if isinstance(device, str) else None)
+    except DeviceError as error:
+        if device is not None:
+            raise
+        return (), (f"errors as read are not measured: {error}",)
+    return tuple(read.data() for read in compared(on, env, request.recipe)), ()
 
 
 def _superseded(request: Order, there: dict[str, Any] | None,
@@ -254,16 +282,48 @@ def _canonical(request: Order, env: Environment) -> dict[str, Any]:
     return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines),
             "rotate": round(math.degrees(env.rotation), 9),
             "exposure": env.exposure, "nonfinite": request.nonfinite, "sun": request.sun, "irradiance": IRRADIANCE_SIZE,
+            **({"as_read": True} if request.as_read else {}),
             "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE}}
 
 
-def _key(env: Environment, recipe: dict[str, Any], ndf: Model) -> str:
+@dataclass(frozen=True)
+class _Held:
+    """An NDF as the key of what is kept between the images of a bake: this very entry, not one of the same name."""
+
+    identity: int
+    given: tuple[tuple[str, Any], ...]
+    choice: Chosen = field(compare=False)
+    """Kept too, so that no other entry takes its identity."""
+
+    @staticmethod
+    def of(choice: Chosen) -> _Held:
+        return _Held(id(choice.model), tuple(sorted(choice.given.items())), choice)
+
+
+@lru_cache(maxsize=4)
+def _table(device: Device, ndf: _Held) -> Integrated:
+    """The DFG table: of the NDF and the device alone, so the same for every image. Not to be written to."""
+    table = dfg(DFG_SIZE, ndf=ndf.choice, tolerance=DFG_TOLERANCE, device=device)
+    table.values.flags.writeable = False
+    return table
+
+
+def _key(env: Environment, recipe: dict[str, Any], ndf: Chosen) -> str:
     """sha256 over the source bytes, the canonical recipe, the kernels and the version."""
-    slots = {"ndf": ndf, "masking": model("masking", "smith")}
-    texts = [source.texels(env.kind), source.overlap(), source.convolution(ndf), source.convolution(None),
-             source.integration(INTEGRALS["dfg"], slots)]
-    parts = [VERSION, env.digest, json.dumps(recipe, sort_keys=True), *(t.digest for t in texts)]
+    parts = [VERSION, env.digest, json.dumps(recipe, sort_keys=True), *_kernel_digests(env.kind, _Held.of(ndf))]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+@lru_cache(maxsize=8)
+def _kernel_digests(kind: str, ndf: _Held) -> tuple[str, ...]:
+    """The digests of every kernel that a bake of a source of this kind may run."""
+    slots = {"ndf": ndf.choice.model, "masking": model("masking", "smith")}
+    texts = [source.texels(kind), source.overlap(), source.convolution(ndf.choice.model), source.convolution(None),
+             source.samples(),
+             source.integration(INTEGRALS["dfg"], slots)]
+    if own := own_kernel_of(INTEGRALS["dfg"], slots):
+        texts.append(source.closed(own, slots))
+    return tuple(t.digest for t in texts)
 
 
 def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
