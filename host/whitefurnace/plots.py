@@ -1,4 +1,5 @@
-"""Figures of models as PNG files: shapes, masking, albedo, Fresnel curves and maps of what float32 is off by.
+"""Figures as PNG files: of models, shapes, masking, albedo, Fresnel curves and maps of what float32 is off by; of the
+prefilter, its error against its time.
 
 Every value comes from the device, as users get it; what it is held against is the float64 reference of the catalogue.
 """
@@ -23,6 +24,7 @@ from whitefurnace.files import write_atomic
 from whitefurnace.run import integrate
 
 if TYPE_CHECKING:
+    from whitefurnace.tradeoff import Cost, Point
     from whitefurnace.verification import Row
 
 # matplotlib is loaded by `draw` alone and has no type here: it is an extra, and takes longer to load than a table.
@@ -107,6 +109,95 @@ def draw(folder: Path, models: Sequence[Model], rows: Sequence[Row], device: Dev
             write_atomic(path, partial(figure.savefig, format="png", dpi=DPI, metadata={"Software": None}))
         written.append(path)
     return written
+
+
+def draw_tradeoff(folder: Path, points: Sequence[Point], costs: Sequence[Cost], device: Device) -> Path:
+    """`folder`/tradeoff.png: error against seconds for each environment with its Pareto front, then the costs.
+
+    Raises as `draw` does.
+    """
+    require()
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    from whitefurnace.tradeoff import COST_TOLERANCE
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot make {folder}: {error.strerror or error}") from error
+    names = list(dict.fromkeys(p.environment for p in points))
+    panels = [_Panel(partial(_tradeoff, [p for p in points if p.environment == name]), 5.4) for name in names]
+    page = [(3.8, panels[k:k + 2]) for k in range(0, len(panels), 2)]
+    varied = list(dict.fromkeys(c.over for c in costs))
+    if varied:
+        page.append((2.6, [_Panel(partial(_cost, [c for c in costs if c.over == over]), 3.3) for over in varied]))
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(STYLE)
+        figure = Figure(dpi=DPI, facecolor="white")
+        FigureCanvasAgg(figure)
+        _lay(figure, page)
+        whose = f"  ·  cost at a tolerance of {COST_TOLERANCE:g} on {costs[0].environment}" if costs else ""
+        _title(figure, "Prefilter: error against time", f"specular chain on {device.identity()['name']}{whose}", "0.35")
+        path = folder / "tradeoff.png"
+        write_atomic(path, partial(figure.savefig, format="png", dpi=DPI, metadata={"Software": None}))
+    return path
+
+
+def _tradeoff(points: Sequence[Point], axes: Axes) -> None:
+    best = sorted((p.seconds.median, p.error) for p in points if p.front)
+    if best:
+        # What is on the front is to be had in that time and all longer ones.
+        x, y = (np.array(v) for v in zip(*best, strict=True))
+        last = max(p.seconds.high for p in points)
+        axes.step(np.append(x, last), np.append(y, y[-1]), where="post", color="0.85", linewidth=6, zorder=1,
+                  label="Pareto front")
+    for method, colour, mark in (("tolerance", BLUE, "o"), ("samples", RED, "s")):
+        some = [p for p in points if p.method == method]
+        if some:
+            x = np.array([p.seconds.median for p in some])
+            spread = np.array([[p.seconds.median - p.seconds.low, p.seconds.high - p.seconds.median] for p in some]).T
+            axes.errorbar(x, [p.error for p in some], xerr=spread, color=colour, marker=mark, elinewidth=1,
+                          linewidth=1.2, label=method)
+        for p in some:
+            axes.annotate(p.label, (p.seconds.median, p.error), xytext=(5, 5), textcoords="offset points", fontsize=8.5,
+                          color="0.3")
+    axes.set(xscale="log", yscale="log", xlabel="seconds, from texels to levels",
+             ylabel="stated error of the worst level", title=points[0].environment)
+    axes.margins(0.12)
+    _seconds(axes.xaxis)
+    _legend(axes, inside="upper right")
+
+
+COST_LABELS = {"output size": ("output size", "face edge of level 0"),
+               "source rows": ("source size", "rows of the source"),
+               "alpha": ("α", "α of one level")}
+
+
+def _seconds(axis: Any) -> None:
+    """Ticks closer than decades where measured times lie within one or two."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    low, high = axis.get_view_interval()
+    steps = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high < 8 * low else (1.0, 2.0, 5.0) if high < 200 * low else (1.0,)
+    axis.set_major_locator(LogLocator(subs=steps))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def _cost(costs: Sequence[Cost], axes: Axes) -> None:
+    x = [c.value for c in costs]
+    axes.fill_between(x, [c.seconds.low for c in costs], [c.seconds.high for c in costs], color=BLUE, alpha=0.2,
+                      linewidth=0)
+    axes.plot(x, [c.seconds.median for c in costs], color=BLUE, marker="o", markersize=5)
+    title, label = COST_LABELS[costs[0].over]
+    axes.set(xscale="log", yscale="log", xlabel=label, ylabel="seconds", title=f"Cost over {title}")
+    if costs[0].over != "alpha":
+        axes.set_xticks(x, [f"{v:g}" for v in x], minor=False)
+        axes.set_xticks([], minor=True)
+    _seconds(axes.yaxis)
 
 
 @dataclass(frozen=True)
@@ -317,11 +408,14 @@ def _heading(sheet: _Sheet, rows: Sequence[Row]) -> None:
     if rows:
         said.append(f"{sum(row.passed for row in rows)} of {len(rows)} checks passed"
                     + (f", failed: {', '.join(failed[:2])}{' …' if len(failed) > 2 else ''}" if failed else ""))
-    width, height = figure.get_size_inches()
     title = entry.title if entry.text is None else f"{entry.name}, {entry.title}"
+    _title(figure, title, "  ·  ".join(filter(None, said)), RED if failed else "0.35")
+
+
+def _title(figure: Figure, title: str, said: str, colour: str) -> None:
+    width, height = figure.get_size_inches()
     figure.text(0.25 / width, 1 - 0.2 / height, title, fontsize=18, fontweight="bold", va="top")
-    figure.text(0.25 / width, 1 - 0.57 / height, "  ·  ".join(filter(None, said)), fontsize=11, va="top",
-                color=RED if failed else "0.35")
+    figure.text(0.25 / width, 1 - 0.57 / height, said, fontsize=11, va="top", color=colour)
 
 
 def _legend(axes: Axes, title: str = "", inside: str | tuple[float, float] | None = None) -> None:
