@@ -1,0 +1,104 @@
+"""Pieces of a file by offset and length, each checked against the file's real size before it is touched: what a header
+says allocates nothing."""
+
+from __future__ import annotations
+
+import os
+import stat
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+
+from whitefurnace.errors import FileError, InputError
+
+Buffer = bytes | memoryview
+
+MAX_BYTES = 8 << 30
+"""No texture may be larger, in its file or unpacked."""
+
+
+class Source:
+    """The bytes of a file and the `name` that its errors begin with."""
+
+    def __init__(self, data: Buffer, name: str) -> None:
+        self.view = memoryview(data)
+        self.name = name
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    def wrong(self, what: str) -> InputError:
+        """The error that says `what` of this file."""
+        return InputError(f"{self.name} is not valid: {what}")
+
+    def piece(self, offset: int, length: int, what: str) -> memoryview:
+        """`length` bytes from `offset`. Raises `InputError` where the file ends before."""
+        if offset < 0 or length < 0 or offset + length > len(self.view):
+            raise InputError(
+                f"{self.name} is truncated or corrupted: {what} would take bytes {offset} to {offset + length}, the "
+                f"file ends at byte {len(self.view)}"
+            )
+        return self.view[offset : offset + length]
+
+    def integers(self, form: str, offset: int, what: str) -> tuple[int, ...]:
+        """Little-endian integers of `struct`'s `form` from `offset`. Raises `InputError`."""
+        return struct.unpack("<" + form, self.piece(offset, struct.calcsize("<" + form), what))
+
+
+def load(path: str | os.PathLike[str]) -> Source:
+    """All of a regular file of at most 8 GiB. Raises `FileError` and, for one that is empty or too large,
+    `InputError`."""
+    path = Path(path)
+    try:
+        status = os.stat(path)  # before it is opened: a pipe would wait for its writer
+        if stat.S_ISDIR(status.st_mode):
+            raise FileError(f"cannot read {path}: it is a folder, a texture file was expected")
+        if not stat.S_ISREG(status.st_mode):
+            raise FileError(f"cannot read {path}: it is not a regular file")
+        if not 0 < status.st_size <= MAX_BYTES:
+            raise InputError(f"{path} has {status.st_size} bytes, a texture has 1 to {MAX_BYTES}")
+        with open(path, "rb") as file:
+            return Source(file.read(status.st_size), str(path))
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+    except ValueError as error:  # a NUL or a lone surrogate in the name
+        raise FileError(f"cannot read {str(path)!r}: {error}") from error
+    except MemoryError as error:
+        raise InputError(f"{path} needs more memory than this machine gives") from error
+
+
+def pack_key_values(pairs: Mapping[str, bytes]) -> bytes:
+    """Key-value data of KTX 1 and 2, sorted by the code points of the keys: size, key, NUL, value, padding to 4."""
+    out = bytearray()
+    for key in sorted(pairs):
+        if not key or "\0" in key:
+            raise ValueError(f"{key!r} is no key, it must have a character and no NUL")
+        pair = key.encode() + b"\0" + pairs[key]
+        out += struct.pack("<I", len(pair)) + pair + bytes(-len(pair) % 4)
+    return bytes(out)
+
+
+def parse_key_values(source: Source, offset: int, length: int) -> dict[str, bytes]:
+    """Key-value data of KTX 1 and 2, values as they are stored. Raises `InputError`."""
+    source.piece(offset, length, "its key-value data")
+    pairs: dict[str, bytes] = {}
+    end = offset + length
+    while offset < end:
+        what = f"the key-value pair at byte {offset}"
+        if end - offset < 4:
+            raise source.wrong(f"{what} has {end - offset} bytes, it needs 4 for its size")
+        (size,) = source.integers("I", offset, what)
+        if not 2 <= size <= end - offset - 4:
+            raise source.wrong(f"{what} says that it has {size} bytes, between 2 and {end - offset - 4} can be there")
+        key, nul, value = bytes(source.piece(offset + 4, size, what)).partition(b"\0")
+        try:
+            name = key.decode()
+        except UnicodeDecodeError:
+            raise source.wrong(f"{what} has a key that is not UTF-8") from None
+        if not nul or not name:
+            raise source.wrong(f"{what} has no key that ends with a NUL")
+        if name in pairs:
+            raise source.wrong(f"{what} repeats a key, each may be there once")
+        pairs[name] = value
+        offset += 4 + size + -size % 4
+    return pairs
