@@ -12,7 +12,6 @@
 //
 // partial: [split][8·CHANNELS + 1][outputs], CHANNELS = 3·PERMS: the sums, then ∑K w.
 
-#define CHANNELS (3 * PERMS)
 #define RUN 64   // classes whose kernel values wait in cache while they are summed
 #define TILE 16  // classes that are taken or left together, 4 × 4 neighbours
 #if PRECISION == 64
@@ -20,18 +19,6 @@
 #else
 #define QUAD float4
 #endif
-
-static inline xyz exchanged(xyz d, int k) {
-  const scalar v[3] = {d.x, d.y, d.z};
-  const int order[6][3] = {{0, 1, 2}, {2, 1, 0}, {1, 2, 0}, {2, 0, 1}, {0, 2, 1}, {1, 0, 2}};
-  const xyz r = {v[order[k][0]], v[order[k][1]], v[order[k][2]]};
-  return r;
-}
-
-static inline xyz reflected(xyz d, int s) {
-  const xyz r = {s & 1 ? -d.x : d.x, s & 2 ? -d.y : d.y, s & 4 ? -d.z : d.z};
-  return r;
-}
 
 // A class as whole numbers: its grid coordinates, odd and positive, and n along its face's axis. Classes are quarter faces
 // +x +y +z, where n is a multiple of 16 in tiles of 4 × 4 within 8 × 8.
@@ -224,44 +211,6 @@ __kernel void convolve_close(__global scalar *restrict partial, const int output
         }
       }
     }
-}
-
-// The excess of bright texels, a list of (x, y, z, w, wL_r, wL_g, wL_b, 0), exactly for every output: sums as those of
-// `convolve_close`, one exchange of axes a work item.
-__kernel void convolve_apart(__global scalar *restrict partial, const int outputs, const int sources,
-                             __global const scalar *restrict direction, __global const scalar *restrict source
-                             LOBE_SCALARS) {
-  const int g = get_global_id(0), e = get_global_id(1);
-  if ((g + 1) * W > outputs) return;
-  const real x = LOAD(g, direction), y = LOAD(g, direction + outputs), z = LOAD(g, direction + 2 * outputs);
-  // K(ρ t o·b) = K(o·t ρ⁻¹ b); of the exchanges only the two cycles are not their own inverse.
-  const xyz numbers = {0, 1, 2}, order = exchanged(numbers, e == 2 ? 3 : e == 3 ? 2 : e);
-  const int ox = order.x, oy = order.y, oz = order.z;
-  real total[8][3];
-  for (int u = 0; u < 8; u++)
-    for (int k = 0; k < 3; k++) total[u][k] = 0;
-  for (int first = 0; first < sources; first += 128) {
-    const int end = min(first + 128, sources);
-    real sum[8][3];
-    for (int u = 0; u < 8; u++)
-      for (int k = 0; k < 3; k++) sum[u][k] = 0;
-    for (int j = first; j < end; j++) {
-      __global const scalar *p = source + 8 * (size_t)j;
-      const scalar px = p[ox], py = p[oy], pz = p[oz];
-      const real xm = sqr(x - px), xp = sqr(x + px), ym = sqr(y - py), yp = sqr(y + py), zm = sqr(z - pz),
-                 zp = sqr(z + pz);
-      const real u0 = ym + zm, u1 = yp + zm, u2 = ym + zp, u3 = yp + zp;
-      const real q[8] = {xm + u0, xp + u0, xm + u1, xp + u1, xm + u2, xp + u2, xm + u3, xp + u3};
-      real K[8];
-      lobe_of_8(K, q LOBE_VALUES);
-      for (int u = 0; u < 8; u++)
-        for (int k = 0; k < 3; k++) sum[u][k] += K[u] * p[4 + k];
-    }
-    for (int u = 0; u < 8; u++)
-      for (int k = 0; k < 3; k++) total[u][k] += sum[u][k];
-  }
-  for (int u = 0; u < 8; u++)
-    for (int k = 0; k < 3; k++) STORE(total[u][k], g, partial + (size_t)(u * CHANNELS + 3 * e + k) * outputs);
 }
 
 // number: two whole numbers of each output o. Of a cube of size × size: its two smaller coordinates, odd (0 where size is 1).

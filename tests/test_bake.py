@@ -21,7 +21,7 @@ import OpenImageIO as oiio
 import pytest
 
 from reference import cube_directions
-from whitefurnace import bake, prefilter
+from whitefurnace import bake, dfg, prefilter
 from whitefurnace.cli import main
 from whitefurnace.environments import cube_solid_angles
 from whitefurnace.errors import UsageError
@@ -273,6 +273,22 @@ def test_every_option_that_changes_the_output_changes_the_key(tmp_path, shell, o
     assert keys[0] != keys[1]
 
 
+def test_what_is_kept_between_images_is_the_right_one(tmp_path):
+    """In one process: two NDFs, two parameters of one, and a user's file that is edited between bakes and keeps its
+    name. Each bake has the table of its own NDF, and what was baked before is not taken for it."""
+    lobe, picture = tmp_path / "mine.clh", noise(height=4)
+    sizes, tables, keys = dict(size=8, min_size=8), [], []
+    for k, ndf in enumerate(["ggx", "beckmann", "abc:c=2", "abc:c=3", lobe, lobe, "ggx"]):
+        if ndf is lobe:
+            lobe.write_text(f"real ndf_mine_D(real cos_m, real alpha) {{ return {k + 1}.0f * cos_m + alpha; }}\n")
+        (baked,) = bake(picture, tmp_path / str(k), ndf=ndf, **sizes)
+        tables.append(np.load(tmp_path / str(k) / "raw" / "array.npz")["dfg"])
+        keys.append(baked.manifest["key"])
+        assert np.array_equal(tables[k], dfg(tables[k].shape[0], ndf=ndf).values), ndf
+    assert len(set(keys)) == len(keys) - 1 and keys[0] == keys[-1]
+    assert len({table.tobytes() for table in tables}) == len(tables) - 1
+
+
 @pytest.mark.parametrize("where", ["raw/a.npz", "a.json"])
 def test_a_foreign_file_is_refused_and_untouched(tmp_path, shell, where):
     source, out = image(tmp_path / "a.exr", noise()), tmp_path / "out"
@@ -357,7 +373,8 @@ def test_json_is_json_lines_only(tmp_path, shell):
     for arguments, last in ((("--dry-run",), "planned"), ((), "done"), ((), "skipped")):
         assert shell("bake", source, "-o", out, *SMALL, "--json", *arguments) == 0
         rows = shell.rows()
-        assert [row["event"] for row in rows] == ["level"] * 3 + [last]
+        shown = ["as_read"] * (len(rows) - 4) if arguments else []
+        assert [row["event"] for row in rows] == ["level"] * 3 + shown + [last]
         assert [(row["size"], round(row["roughness"], 6)) for row in rows[:3]] == [(n, round(r, 6)) for n, r in LEVELS]
         assert {"key", "files", "seconds"} <= set(rows[-1]) and shell.err == ""
     assert shell("bake", tmp_path / "none.exr", "-o", out, "--json") == 2

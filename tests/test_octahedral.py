@@ -119,7 +119,7 @@ def symmetric(o: Octahedral, shape: Shape, lobe: Lobe, parts: list[Part], grids:
             for k, part in enumerate(some):
                 o.convolve(partial, k * splits, splits, found, lobe, part, classes[part.grid], error)
             sums.append(partial if some else None)
-        apart = o.apart(found, lobe, o.device.array(bright.astype(o.kind)), error) if bright is not None else None
+        apart = o.apart(found, lobe, o.device.array(bright.astype(o.kind))) if bright is not None else None
         assert sums[0]
         o.unfold(level, found, sums[0], sums[1], apart, PER_NORM, BASE)
     return level.read()

@@ -77,7 +77,7 @@ def test_the_table_of_layouts_names_every_layout():
 
 
 def test_the_options_of_the_readme_exist():
-    told = "".join(run(command, "--help").stdout for command in ("bake", "lut", "verify", "models", "devices"))
+    told = "".join(run(command, "--help").stdout for command in ("bake", "lut", "verify", "bench", "models", "devices"))
     for option in set(re.findall(r"`(--[a-z-]+)", README)):
         assert option in told, option
 

@@ -60,10 +60,14 @@ FLOPS: Mapping[str, float] = {
     # Two filters of five taps 36, node 3, face coordinates 19 and their test 5, two arctangents 36, places 6 and
     # stencils 12, two bases 62, w L 3, rows 32, 256 multiply-adds 512.
     "anterpolate": 726,
+    # Eight distances 24 shared by eight pairs, the lobe 8, three multiply-adds 6.
+    "apart": 17,
     # Face coordinates 6, two arctangents 36, places 18, two bases 62, 72 multiply-adds of four 576.
     "interpolate": 698,
     # Azimuth's cosine 14, v·h 3, n·l 3, Fc 4, Smith's area of l 9, V 6, what is visible and its weight 3, two sums 5.
     "dfg": 47,
+    # p/q of two steps 18, S and w 5, (w/q)² dφ 7, Fc 7, the sum 2; the ring's 150 are shared by 16.
+    "dfg-closed": 48,
     # exp 23 and sinh 4, the slope's vector 10, v·h 6, l 8, Fc 4, area of l 10, V 6, visible 3, sums 9, D 11, measure 8.
     "dfg-anisotropic": 102,
     # l 2, measure 1, Burley's f 14 (that of v and n·l comes before), the sum 2.
@@ -337,6 +341,20 @@ def _anterpolate(device: Device, precision: int, scale: int) -> Work:
                 lambda: Texels(device, env, precision))
 
 
+def _apart(device: Device, precision: int, scale: int) -> Work:
+    """256 nodes of bright texels for the outputs of a cube."""
+    kind, symmetries, lobe = np.dtype(f"f{precision // 8}"), Octahedral(device, precision), _ggx(device)
+    shape, listed = Shape(False, min(16 * scale, 1024)), np.zeros((256, 8), kind)
+    listed[:, :3], listed[:, 4:7] = _directions(256).T, _rng().random((256, 3))
+    buffer, tiles = device.array(listed), symmetries.orbits(shape)
+
+    def run(_: Any) -> None:
+        for found in tiles:
+            symmetries.apart(found, lobe, buffer)
+
+    return Work(run, 256.0 * shape.count, float(listed.nbytes + kind.itemsize * 3 * shape.count))
+
+
 def _interpolate(device: Device, precision: int, scale: int) -> Work:
     """A level of a cube from 128² nodes a face."""
     convolver, shape = Convolver(device, _noise(16), precision=precision), Shape(False, min(64 * scale, 1024))
@@ -381,6 +399,12 @@ def _dfg(device: Device, precision: int, scale: int) -> Work:
     slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith")}
     return _sum(device, source.integration(integral("dfg"), slots).text, "integrate",
                 _cells((0, 1), (0.01, 1), count=2048 * scale), 2, precision, LADDERS["gauss"][4])
+
+
+def _dfg_closed(device: Device, precision: int, scale: int) -> Work:
+    slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith")}
+    return _sum(device, source.closed("dfg_ggx.cl", slots).text, "integrate",
+                _cells((0.01, 1), (0.01, 1), count=2048 * scale), 2, precision, LADDERS["light-angles"][4])
 
 
 def _dfg_anisotropic(device: Device, precision: int, scale: int) -> Work:
@@ -487,12 +511,14 @@ CASES = (
     Case("samples", "samples.cl", "sample", "filtered importance sampling of the same", _samples),
     Case("pyramid", "pyramid.cl", "texel", "the pyramid that the samples are read from", _pyramid),
     Case("anterpolate", "anterpolate.cl", "texel", "a lat-long onto an equiangular grid of 64²", _anterpolate),
+    Case("apart", "apart.cl", "pair", "the same over a list of bright texels, by the NDF itself", _apart),
     Case("interpolate", "interpolate.cl", "texel", "a level's texels read from values at nodes", _interpolate),
     Case("near-texels", "exact.cl", "direction", "a narrow lobe over texels near it, finely cut", _near_texels, (32,)),
     Case("means", "overlap.cl", "texel", "exact means of a lat-long over the texels of a cube", _means, (64,)),
     Case("means-of-cube", "overlap.cl", "texel", "exact means of a turned cube over another", _means_of_cube, (64,)),
     Case("harmonics", "harmonics.cl", "node", "spherical harmonics to degree 2", _harmonics),
     Case("dfg", "integrate.cl", "evaluation", "split-sum pair, GGX with Smith's masking", _dfg),
+    Case("dfg-closed", "dfg_ggx.cl", "evaluation", "split-sum pair, GGX, azimuth in closed form", _dfg_closed),
     Case("dfg-anisotropic", "stretched.cl", "evaluation", "split-sum pair, anisotropic GGX", _dfg_anisotropic),
     Case("hemisphere", "hemisphere.cl", "evaluation", "albedo of a diffuse model, Burley's", _hemisphere),
     Case("area", "area.cl", "node", "projected area for the table of Smith's term", _area),

@@ -45,11 +45,18 @@ def cli(context: click.Context) -> None:
 @click.option("--for", "for_", metavar="LIST", default="raw", show_default=True,
               help="Who loads it, separated by commas: raw (.npz), exr (strips and lat-longs).")
 @click.option("--size", type=int, default=256, show_default=True, help="Face edge of the first level, a power of two.")
-@click.option("--min-size", type=int, default=16, show_default=True, help="Face edge of the last level.")
+@click.option("--min-size", type=int, help="Face edge of the last level. [default: 16]")
+@click.option("--levels", type=int, help="How many levels, down to 1²; those past a --min-size keep that size.")
+@click.option("--fit", metavar="read", help="Levels that read best between them, not each its own lobe.")
+@click.option("--as-read", is_flag=True, help="State what engines will show of them too; --fit and --dry-run do.")
 @click.option("--ndf", metavar="NAME[:p=v,...]", default="ggx", show_default=True,
               help="The lobe; `whitefurnace models` lists them.")
 @click.option("--tolerance", metavar="X", type=float, help="Bound on the stated error of every level. [default: 1e-3]")
 @click.option("--quality", metavar="NAME", help="draft (1e-2), normal (1e-3) or reference (2e-5), for --tolerance.")
+@click.option("--samples", metavar="N", type=int,
+              help="Filtered importance sampling with N samples a texel instead, 1 to 65536; its error is stated.")
+@click.option("--certify", metavar="N", type=int, default=299, show_default=True,
+              help="Texels drawn for each level's statement; more bound it more closely.")
 @click.option("--rotate", metavar="DEG", type=float, default=0.0, help="Turn the environment about +Y, +X towards +Z.")
 @click.option("--exposure", metavar="EV", type=float, default=0.0, help="Multiply radiance by 2^EV.")
 @click.option("--nonfinite", metavar="refuse|zero", default="refuse", show_default=True,
@@ -105,6 +112,8 @@ def bake(environments: tuple[str, ...], output: Path, for_: str, device: str | N
 EPILOG_LUT = """\b
 Examples:
   whitefurnace lut dfg -o dfg.npy --size 256
+  whitefurnace lut dfg -o fitted.npy --size 64 --axis sqrt --fit bilinear
+  whitefurnace lut energy -o energy.npy --size 64 --scheme turquin
   whitefurnace lut albedo -o gold.exr --fresnel schlick:gold --size 64x32
   whitefurnace lut albedo -o sheen.npy --ndf charlie --axis alpha=.01:1:64:log --tolerance 1e-4
   whitefurnace lut albedo_average -o average.npy --fresnel schlick --axis f0=0:1:32
@@ -130,8 +139,11 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device o
               help="The table, .npy or .exr (float32, two axes).")
 @click.option("--size", metavar="N|NxM", default="128", show_default=True, help="Cells along x and y, 1 to 16384.")
 @click.option("--axis", "axes", metavar="NAME=A:B:N[:SCALE]", multiple=True,
-              help="A parameter from A to B in N steps; SCALE is linear, log or centres. Several are several axes.")
+              help="A parameter from A to B in N steps; SCALE: linear, log, centres or sqrt. `sqrt` alone scales NoV.")
 @click.option("--set", "fixed", metavar="NAME=VALUE", multiple=True, help="Fix a parameter.")
+@click.option("--fit", metavar="bilinear", help="Texels that read best between them, of two axes; states --as-read.")
+@click.option("--as-read", is_flag=True, help="State the error of reads between texels too, of float16 and r8 as well.")
+@click.option("--scheme", metavar="NAME", help="Of energy: kulla_conty (the default), turquin or fdez_aguera.")
 @click.option("--ndf", metavar="NAME[:p=v,...]", help="Or FILE.clh. [default: ggx, without a --diffuse or --brdf]")
 @click.option("--masking", metavar="NAME", help="[default: smith]")
 @click.option("--fresnel", metavar="NAME[:p=v,...]", help="Or NAME:PRESET, as schlick:gold. [default: one]")
@@ -155,10 +167,12 @@ def lut(kind: str, output: Path, axes: tuple[str, ...], fixed: tuple[str, ...], 
         as_json: bool, quiet: bool, **options: Any) -> None:
     """Write a table of an integral over a grid of parameters.
 
-    KIND is normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance.
+    KIND is normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance; energy, which is
+    what multiple scattering gives back; sheen, with what it leaves to the layer under it; or fresnel_average.
     """
     from whitefurnace import report, tables
 
+    axes = tuple(f"NoV={item}" if item in tables.SCALES else item for item in axes)
     request = tables.order(kind, output, axes=_named("--axis", axes), parameters=_named("--set", fixed), **options)
     with _progress(not (quiet or as_json)) as tell:
         made = tables.make(request, device, dry_run=dry_run, progress=tell)
@@ -265,6 +279,138 @@ def verify(specs: tuple[str, ...], precision: int | None, folder: Path | None, d
     if failed:
         raise CheckError(f"{len(failed)} of {len(rows)} checks failed, the first: {failed[0].slot} {failed[0].model}, "
                          f"{failed[0].check} in float{failed[0].precision}")
+
+
+EPILOG_BENCH = """\b
+Examples:
+  whitefurnace bench
+  whitefurnace bench convolve dfg --json
+  whitefurnace bench tradeoff studio.hdr demo --plot figures
+  whitefurnace bench --dry-run
+
+\b
+Kernels are timed by the device's own clock: the median of several runs with the least and the largest, one before them
+left out. Of peak and of memory are ratios to multiply-adds from registers and to memory that is read, run beside them.
+tradeoff bakes the specular chain of each ENV by every method and setting: seconds from texels in memory to levels, the
+certificate apart, and the stated error of the worst level; `front` is what no other setting beats. On the first ENV it
+also measures what output size, source size and roughness cost.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported,
+130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_BENCH)
+@click.argument("words", metavar="[CASE...|tradeoff ENV...]", nargs=-1)
+@click.option("--size", type=int, help="Of tradeoff: face edge of the first level. [default: 256]")
+@click.option("--min-size", type=int, help="Of tradeoff: face edge of the last level. [default: 16]")
+@click.option("--runs", type=int, help="Runs of each. [default: 7, of tradeoff at most 5 within 3 s]")
+@click.option("--plot", "folder", metavar="DIR", type=click.Path(path_type=Path),
+              help="Of tradeoff: draw tradeoff.png into this folder.")
+@click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
+@click.option("--dry-run", is_flag=True, help="Say what would be measured, and do nothing.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
+def bench(words: tuple[str, ...], size: int | None, min_size: int | None, runs: int | None, folder: Path | None,
+          device: str | None, dry_run: bool, as_json: bool) -> None:
+    """Measure kernels against what the device can do, or the prefilter's error against its time.
+
+    All kernels without a CASE; --dry-run lists them. ENV is what `bake` takes.
+    """
+    from whitefurnace import benching, report
+    from whitefurnace.device import choose_device
+    from whitefurnace.errors import UsageError
+
+    if runs is not None and not 1 <= runs <= 1000:
+        raise UsageError(f"runs {runs} is outside [1, 1000]")
+    if words and words[0] == "tradeoff":
+        _tradeoff(words[1:], 256 if size is None else size, 16 if min_size is None else min_size, runs, folder, device,
+                  dry_run, as_json)
+        return
+    for name, given in (("--size", size), ("--min-size", min_size), ("--plot", folder)):
+        if given is not None:
+            raise UsageError(f"{name} is of `bench tradeoff ENV...`")
+    cases = benching.cases(words)
+    if dry_run:
+        for planned in report.case_rows(cases, benching.FLOPS) if as_json else ():
+            _json(planned)
+        if not as_json:
+            click.echo(report.cases_text(cases, benching.FLOPS))
+        return
+    on = choose_device(device)
+    meter = benching.Meter(on)
+    rows = []
+    with _progress(not as_json) as tell:
+        for row in benching.throughput(cases, on, meter, runs or benching.RUNS,
+                                       (lambda what, share: tell("bench", what, share)) if tell else None):
+            rows.append(row)
+            if as_json:
+                _json(report.bench_row(row))
+    yardstick, said = meter.yardstick(), on.identity()
+    if as_json:
+        _json(report.yardstick_row(yardstick, said))
+    else:
+        click.echo(report.bench_text(rows, yardstick, f"{said['name']} ({said['platform']})"))
+
+
+def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | None, folder: Path | None,
+              device: str | None, dry_run: bool, as_json: bool) -> None:
+    from whitefurnace import report, tradeoff
+    from whitefurnace.device import choose_device
+    from whitefurnace.errors import FileError, UsageError
+
+    if not sources:
+        raise UsageError("bench tradeoff wants one environment or several: images, or the word demo")
+    tradeoff.check(size, min_size)
+    if dry_run:
+        for source in sources:
+            if as_json:
+                _json({"event": "planned", "environment": source, "methods": tradeoff.methods()})
+            else:
+                click.echo(f"{source}: would measure " + ", ".join(f"{m} {x:g}" for m, x in tradeoff.methods()))
+        return
+    if folder is not None:
+        from whitefurnace import plots
+
+        plots.require()
+        try:
+            folder.mkdir(parents=True, exist_ok=True)  # before the work, not after it
+        except OSError as error:
+            raise FileError(f"{folder}: cannot be made: {error.strerror}") from None
+    on = choose_device(device)
+    points: list[tradeoff.Point] = []
+    costs: list[tradeoff.Cost | tradeoff.Missed] = []
+    with _progress(not as_json) as tell:
+        for source in sources:
+            env = tradeoff.load(source, on)
+            told = (lambda what, share, name=env.name: tell(name, what, share)) if tell else None
+            found = list(tradeoff.points(env, on, size=size, min_size=min_size, runs=runs or tradeoff.RUNS,
+                                         progress=told))
+            own = tradeoff.with_front([p for p in found if isinstance(p, tradeoff.Point)])
+            missed = [p for p in found if isinstance(p, tradeoff.Missed)]
+            points += own
+            for row in report.tradeoff_rows([*own, *missed]) if as_json else ():
+                _json(row)
+            if not as_json:
+                click.echo(report.tradeoff_text(own, missed))
+            if source is sources[0]:
+                costs = list(tradeoff.costs(env, on, size=size, min_size=min_size, runs=runs or tradeoff.RUNS,
+                                            progress=told))
+    for row in report.tradeoff_rows(costs) if as_json else ():
+        _json(row)
+    said, measured = on.identity(), [c for c in costs if isinstance(c, tradeoff.Cost)]
+    if not as_json:
+        click.echo(report.costs_text(measured, tradeoff.COST_TOLERANCE,
+                                     [c for c in costs if isinstance(c, tradeoff.Missed)]))
+        click.echo(f"on {said['name']} ({said['platform']})")
+    else:
+        _json({"event": "device", "device": said})
+    if folder is not None:
+        path = plots.draw_tradeoff(folder, points, measured, on)
+        if as_json:
+            _json({"event": "plot", "file": str(path)})
+        else:
+            click.echo(f"  wrote {path}")
 
 
 @cli.command(epilog="\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 one works, 4 none does.")

@@ -119,7 +119,7 @@ class Convolver:
         self.interpolate(level, shape, grid)
         if bright:
             for found in s.orbits(shape):
-                s.unfold(level, found, None, None, s.apart(found, lobe, bright, error), 1 / lobe.norm, np.zeros(3))
+                s.unfold(level, found, None, None, s.apart(found, lobe, bright), 1 / lobe.norm, np.zeros(3))
         return level.read()
 
     def _sum_parts(self, level: Buffer, lobe: Lobe, shape: Shape, n: int, bright: Buffer | None, error: float,
@@ -143,7 +143,7 @@ class Convolver:
                     s.convolve(partial, sum(splits[:k]), splits[k], found, lobe, part,
                                self._sources(part.grid, exchanges), error)
                 sums.append(partial)
-            apart = s.apart(found, lobe, bright, error) if bright else None
+            apart = s.apart(found, lobe, bright) if bright else None
             s.unfold(level, found, sums[0], sums[1], apart, 1 / lobe.norm, base)
             done += found.count
             self.progress(lobe.name, share[0] + (share[1] - share[0]) * min(done * 8 * exchanges / shape.count, 1.0))

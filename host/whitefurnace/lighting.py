@@ -248,7 +248,7 @@ def _references(convolver: Convolver, jobs: Sequence[Job], samples: Sequence[tup
                 mean = convolver.mean * convolver.scale
                 doubts[k] = float(texel_errors(references[k][dark[k]], values, mean).max()) / (seen[k] or 1.0)
                 # On small images more nodes cost nothing: there the reference is made exact, not just good enough.
-                cheap = convolver.texels.nodes(cuts) <= 4 * planning.NODES_A_BAND
+                cheap = convolver.texels.nodes(cuts) <= planning.NODES_A_BAND
                 if doubts[k] <= tolerance / (100 if cheap else 10):
                     continue
                 if grids[k]:

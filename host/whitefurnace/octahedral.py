@@ -219,13 +219,15 @@ class Octahedral:
                                (*head(image.shape[1], np.int32(origin)), image, group, tile,
                                 self.kind.type(part.outer.q1), *series))
 
-    def apart(self, found: Orbits, lobe: Lobe, listed: Buffer, error: float) -> Buffer:
-        """Sums over a list of single sources, for every output."""
-        partial = self.empty(1, found)
-        items = found.padded // self.lanes
-        self.device.launch(self._kernel("convolve_apart", found.exchanges), (items, found.exchanges),
-                           (partial, np.int32(found.padded), np.int32(listed.shape[0]), self._direction(found), listed,
-                            *self._series(lobe, None, None, error)))
+    def apart(self, found: Orbits, lobe: Lobe, listed: Buffer) -> Buffer:
+        """Sums over a list of single sources, for every output, by the NDFs themselves."""
+        real, partial = self.kind.type, self.empty(1, found)
+        for k, (entry, numbers, weight) in enumerate(lobe.summands or ((None, (), 1.0),)):
+            program = self.device.build(source.apart(entry).text, {
+                "W": self.lanes, "T": 1, "PRECISION": self.precision, "PERMS": found.exchanges})
+            self.device.launch(program.kernel("convolve_apart"), (found.padded // self.lanes, found.exchanges),
+                               (partial, np.int32(found.padded), np.int32(listed.shape[0]), self._direction(found),
+                                listed, real(weight), np.int32(k > 0), *(real(value) for value in numbers)))
         return partial
 
     def unfold(self, level: Buffer, found: Orbits, whole: Buffer | None, close: Buffer | None, apart: Buffer | None,

@@ -10,9 +10,11 @@ from whitefurnace.catalogue.bibliography import PAPERS
 
 if TYPE_CHECKING:
     from whitefurnace.baking import Baked
+    from whitefurnace.benching import Case, Spread, Throughput, Yardstick
     from whitefurnace.catalogue import Model
     from whitefurnace.device import Candidate
     from whitefurnace.tables import Table
+    from whitefurnace.tradeoff import Cost, Missed, Point
     from whitefurnace.verification import Row
 
 
@@ -68,6 +70,7 @@ def baked_text(baked: Baked, output: Path) -> str:
              table(["", "size", "r", "error", "worst", "rmse", "method", "time"], rows)]
     if "sun" in m:
         lines.append(f"  sun: direction ({towards}), irradiance facing it ({triple}), π times the light colour c")
+    lines += as_read_lines(baked.as_read)
     for relative, entry in sorted(m["files"].items()):
         lines.append(f"  wrote {output / relative}  {size(entry['bytes'])}")
     lines.append(f"  wrote {output / (baked.name + '.json')}  the manifest; {baked.seconds:.2f} s in all")
@@ -76,13 +79,29 @@ def baked_text(baked: Baked, output: Path) -> str:
 
 def planned_text(baked: Baked) -> str:
     """What a bake would do."""
-    rows = [[f"specular {k}", f"{p.size}²", f"{p.roughness:.3f}", f"{p.grid}²" if p.grid else "texel mean",
-             f"{p.pairs:.2g}", f"{p.cuts}×{p.cuts}"] for k, p in enumerate(baked.plan)]
+    methods = [f"{p.grid}²" if p.grid else f"{p.samples} samples" if p.samples else "texel mean" for p in baked.plan]
+    rows = [[f"specular {k}", f"{p.size}²", f"{p.roughness:.3f}", methods[k], f"{p.pairs:.2g}", f"{p.cuts}×{p.cuts}"]
+            for k, p in enumerate(baked.plan)]
     lines = [f"{baked.name}: would bake, key {baked.manifest['key'][:12]}…",
              table(["", "size", "r", "source grid a face", "lobe evaluations", "nodes a texel"], rows)]
     for path, nbytes in zip(baked.files, baked.nbytes, strict=True):
         lines.append(f"  would write {path}  {size(nbytes)} before compression")
-    return "\n".join(lines)
+    return "\n".join([*lines, *as_read_lines(baked.as_read)])
+
+
+AS_READ = ("between", "texels", "levels", "format", "all")
+
+
+def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What engines show of chains, part by part; parts that none of them measured are left out."""
+    if not found:
+        return []
+    parts = [part for part in AS_READ if any(part in read["parts"] for read in found)]
+    rows = [[str(read["levels"]), f"{read['sizes'][-1]}²", read["fit"] or "own lobe",
+             *(f"{read['parts'][part]['mean']:.2g}" if part in read["parts"] else "" for part in parts),
+             f"{read['parts']['all' if 'all' in read['parts'] else 'between']['p95']:.2g}"] for read in found]
+    return [f"  as read from {found[0]['format']}: error of what engines show, mean over r of the RMS over directions",
+            table(["levels", "last", "fit", *parts, "p95"], rows, left=3)]
 
 
 def baked_rows(baked: Baked) -> list[dict[str, Any]]:
@@ -90,9 +109,11 @@ def baked_rows(baked: Baked) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     if baked.state == "planned":
         rows += [{"event": "level", "name": baked.name, "level": k, "size": p.size, "roughness": p.roughness,
-                  "grid": p.grid, "pairs": p.pairs, "cuts": p.cuts} for k, p in enumerate(baked.plan)]
+                  "grid": p.grid, "samples": p.samples, "pairs": p.pairs, "cuts": p.cuts}
+                 for k, p in enumerate(baked.plan)]
     else:
         rows += [{"event": "level", "name": baked.name, "level": k, **row} for k, row in enumerate(baked.levels)]
+    rows += [{"event": "as_read", "name": baked.name, **read} for read in baked.as_read]
     m = baked.manifest
     whole: dict[str, Any] = {"event": baked.state, "name": baked.name, "key": m["key"], "seconds": baked.seconds,
                              "notices": list(baked.notices)}
@@ -119,9 +140,28 @@ def table_text(table: Table) -> str:
     if table.state == "planned":
         return "\n".join([*lines, f"  would write {name}  {size(table.nbytes)} before compression",
                           f"  would write {beside}  the manifest"])
+    lines += _told_of_table(m)
     return "\n".join([*lines, f"  error {m['error']:.1e}, rule {m['rule']}, {m['evaluations']:.2g} evaluations, "
                       f"on {m['device']['name']} ({m['device']['platform']})",
                       f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {table.seconds:.2f} s"])
+
+
+def _told_of_table(m: Mapping[str, Any]) -> list[str]:
+    """What a manifest says of a table beside its error."""
+    lines = []
+    if "channels" in m:
+        lines += [f"  channels  {', '.join(m['channels'])}", f"  formula   {m['formula']}"]
+    if "furnace" in m:
+        lines += [f"  furnace at F = 1: off by {m['furnace']:.1e}; "
+                  f"f(l, v) and f(v, l) differ by {m['non_reciprocity']:.2g}",
+                  "  off Kulla and Conty's at F0 = " +
+                  ", ".join(f"{f0}: {off:.1e}" for f0, off in m["deviation"].items())]
+    if "as_read" in m:
+        read = m["as_read"]
+        rows = [(name, *(f"{e[k]:.1e}" for k in ("p99", "max", "max_all"))) for name, e in
+                (("at texel centres", read["centres"]), *((f"between, {k}", e) for k, e in read["between"].items()))]
+        lines.append(table(["  as read", "p99", "max", "max, with r < .045"], [(f"  {r[0]}", *r[1:]) for r in rows]))
+    return lines
 
 
 def table_row(table: Table) -> dict[str, Any]:
@@ -232,3 +272,87 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else str(value)
     return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+# ---------------------------------------------------------------------------------------------- bench
+
+
+def _spread(spread: Spread, factor: float, digits: int = 3) -> tuple[str, str]:
+    """Median, and (least … largest), times a factor."""
+    median, low, high = (f"{float(f'{x * factor:.{digits}g}'):g}" for x in (spread.median, spread.low, spread.high))
+    return median, f"({low} … {high})"
+
+
+def cases_text(cases: Sequence[Case], flops: Mapping[str, float]) -> str:
+    """What can be measured."""
+    return table(["case", "kernel", "what", "counted in", "flops"],
+                 [[c.name, c.kernel, c.about, f"{c.unit}s", f"{flops[c.name]:g}" if c.name in flops else ""]
+                  for c in cases], left=4)
+
+
+def case_rows(cases: Sequence[Case], flops: Mapping[str, float]) -> list[dict[str, Any]]:
+    """JSON rows of what can be measured."""
+    return [{"event": "planned", "case": c.name, "kernel": c.kernel, "about": c.about, "unit": c.unit,
+             "flops": flops.get(c.name), "precisions": list(c.precisions)} for c in cases]
+
+
+def bench_text(rows: Sequence[Throughput], yardstick: Yardstick, device: str) -> str:
+    """The throughput of kernels beside what the device can do."""
+    can = [[f"multiply-adds, float{p}", *_spread(s, 1), "GFLOP/s"] for p, s in yardstick.peak.items()]
+    can += [[what, *_spread(s, 1), "GB/s"] for what, s in (("memory read", yardstick.read),
+                                                           ("memory triad", yardstick.triad))]
+    cells = []
+    for r in rows:
+        flops = ["", ""] if r.gflops is None or r.of_peak is None else [f"{r.gflops:.3g}", f"{r.of_peak:.2f}"]
+        cells.append([r.case, str(r.precision), *_spread(r.rate, 1e-6), f"M {r.unit}s/s", *flops, f"{r.gbytes:.2g}",
+                      f"{r.of_memory:.2f}"])
+    return "\n".join([device, table(["yardstick", "median", "(min … max)", ""], can), "",
+                      table(["case", "float", "median", "(min … max)", "", "GFLOP/s", "of peak", "GB/s", "of memory"],
+                            cells)])
+
+
+def bench_row(row: Throughput) -> dict[str, Any]:
+    """The JSON row of a kernel."""
+    found = {name: value for name, value in vars(row).items() if name != "rate"}
+    return {"event": "case", "per_second": _three(row.rate), **found}
+
+
+def yardstick_row(yardstick: Yardstick, device: Mapping[str, str]) -> dict[str, Any]:
+    """The JSON row of what the device can do."""
+    return {"event": "yardstick", "device": dict(device),
+            "gflops": {f"float{p}": _three(s) for p, s in yardstick.peak.items()},
+            "read_gbytes": _three(yardstick.read), "triad_gbytes": _three(yardstick.triad)}
+
+
+def _three(spread: Spread) -> dict[str, float]:
+    return {"median": spread.median, "min": spread.low, "max": spread.high}
+
+
+def tradeoff_text(points: Sequence[Point], missed: Sequence[Missed] = ()) -> str:
+    """Error against time on one environment."""
+    name = (points[0] if points else missed[0]).environment
+    cells = [[p.method, p.label, *_spread(p.seconds, 1e3), f"{1e3 * p.certificate:.3g}", f"{p.error:.1e}",
+              f"{p.worst:.1e}", f"{p.rmse:.1e}", "front" if p.front else ""] for p in points]
+    head = ["method", "setting", "ms", "(min … max)", "certificate", "error", "worst", "rmse", ""]
+    return "\n".join([name, table(head, cells, left=2), *_missed(missed)])
+
+
+def costs_text(costs: Sequence[Cost], tolerance: float, missed: Sequence[Missed] = ()) -> str:
+    """What makes a level dear."""
+    name = (costs[0] if costs else missed[0]).environment
+    return "\n".join([f"cost at {tolerance:g} on {name}",
+                      table(["over", "value", "ms", "(min … max)"],
+                            [[c.over, f"{c.value:g}", *_spread(c.seconds, 1e3)] for c in costs]), *_missed(missed)])
+
+
+def _missed(missed: Sequence[Missed]) -> list[str]:
+    return [f"  {m.method} {m.setting:g}: {m.why}" for m in missed]
+
+
+def tradeoff_rows(found: Sequence[Point | Missed | Cost]) -> list[dict[str, Any]]:
+    """JSON rows of points, of those that could not be made, and of costs."""
+    rows = []
+    for one in found:
+        row = {**vars(one), "event": type(one).__name__.lower()}
+        rows.append({name: _three(value) if name == "seconds" else value for name, value in row.items()})
+    return rows

@@ -287,7 +287,15 @@ def near_texels(kind: str, ndf: Model) -> Source:
 
 def octahedral() -> Source:
     """The zonal convolution by the symmetries of the cube, of any lobe."""
-    return _assemble(["real.clh", "sphere.clh", "window.clh", "lobe_table.clh", "octahedral.cl"])
+    return _assemble(["real.clh", "sphere.clh", "orbits.clh", "window.clh", "lobe_table.clh", "octahedral.cl"])
+
+
+def apart(ndf: Model | None) -> Source:
+    """The excess of bright texels under the lobe of an NDF, or under the cosine of irradiance for None."""
+    if ndf is None:
+        return _assemble(["real.clh", "sphere.clh", "orbits.clh", "lobe_cosine.clh", "apart.cl"])
+    return _assemble(["real.clh", "sphere.clh", "orbits.clh", ("bindings", _bindings({"ndf": ndf})),
+                      *_models({"ndf": ndf}, 0), "lobe.clh", "apart.cl"])
 
 
 def interpolation() -> Source:

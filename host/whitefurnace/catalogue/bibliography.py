@@ -5,19 +5,33 @@ PAPERS = {
                   "Micro-facet Distribution, CGF 31(4), 2012",
     "BornWolf1999": "M. Born, E. Wolf, Principles of Optics, 7th edition, Cambridge University Press, 1999",
     "Burley2012": "B. Burley, Physically Based Shading at Disney, SIGGRAPH 2012 course",
+    "Clenshaw1955": "C. Clenshaw, A Note on the Summation of Chebyshev Series, MTAC 9(51), 1955",
+    "Colbert2007": "M. Colbert, J. Křivánek, GPU-Based Importance Sampling, GPU Gems 3, chapter 20, 2007",
     "CookTorrance1982": "R. Cook, K. Torrance, A Reflectance Model for Computer Graphics, ACM TOG 1(1), 1982",
     "Estevez2017": "A. C. Estevez, C. Kulla, Production Friendly Microfacet Sheen BRDF, SIGGRAPH 2017 course",
+    "FdezAguera2019": "C. J. Fdez-Agüera, A Multiple-Scattering Microfacet Model for Real-Time Image-Based Lighting, "
+                      "JCGT 8(1), 2019",
+    "Frisvad2012": "J. R. Frisvad, Building an Orthonormal Basis from a 3D Unit Vector Without Normalization, Journal "
+                   "of Graphics Tools 16(3), 2012",
     "Fujii2012": "Y. Fujii, A Tiny Improvement of Oren-Nayar Reflectance Model, 2012",
+    "Goldfarb1983": "D. Goldfarb, A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic "
+                    "Programs, Mathematical Programming 27, 1983",
     "Heitz2014": "E. Heitz, Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs, JCGT 3(2), 2014",
     "Hoffman2012": "N. Hoffman, Background: Physics and Math of Shading, SIGGRAPH 2012 course",
     "Kahan1965": "W. Kahan, Further Remarks on Reducing Truncation Errors, Communications of the ACM 8(1), 1965",
     "Karis2013": "B. Karis, Real Shading in Unreal Engine 4, SIGGRAPH 2013 course",
     "Kelemen2001": "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with Importance "
                    "Sampling, Eurographics short presentations, 2001",
+    "Krivanek2008": "J. Křivánek, M. Colbert, Real-Time Shading with Filtered Importance Sampling, CGF 27(4), 2008",
+    "KullaConty2017": "C. Kulla, A. Conty, Revisiting Physically Based Shading at Imageworks, SIGGRAPH 2017 course",
     "Kutz2021": "P. Kutz, M. Hašan, E. Edmondson, Novel Aspects of the Adobe Standard Material, Adobe, 2021",
     "Lagarde2014": "S. Lagarde, C. de Rousiers, Moving Frostbite to Physically Based Rendering, SIGGRAPH 2014 course",
+    "Lawson1961": "C. L. Lawson, Contributions to the Theory of Linear Least Maximum Approximation, PhD thesis, UCLA, "
+                  "1961",
     "Low2012": "J. Löw et al., BRDF Models for Accurate and Efficient Rendering of Glossy Surfaces, ACM TOG 31(1), "
                "2012",
+    "McCalpin1995": "J. McCalpin, Memory Bandwidth and Machine Balance in Current High Performance Computers, IEEE "
+                    "TCCA Newsletter, 1995",
     "Minnaert1941": "M. Minnaert, The Reciprocity Principle in Lunar Photometry, Astrophysical Journal 93, 1941",
     "Neumann1999": "L. Neumann, A. Neumann, L. Szirmay-Kalos, Compact Metallic Reflectance Models, CGF 18(3), 1999",
     "OrenNayar1994": "M. Oren, S. Nayar, Generalization of Lambert's Reflectance Model, SIGGRAPH 1994",
@@ -27,6 +41,9 @@ PAPERS = {
                        "SIGGRAPH 2001",
     "Schlick1994": "C. Schlick, An Inexpensive BRDF Model for Physically-Based Rendering, CGF 13(3), 1994",
     "Shirley1997": "P. Shirley et al., A Practitioners' Assessment of Light Reflection Models, Pacific Graphics 1997",
+    "Turquin2019": "E. Turquin, Practical Multiple Scattering Compensation for Microfacet Models, Industrial Light & "
+                   "Magic, 2019",
     "VanOosterom1983": "A. Van Oosterom, J. Strackee, The Solid Angle of a Plane Triangle, IEEE TBME 30(2), 1983",
+    "Vogel1979": "H. Vogel, A Better Way to Construct the Sunflower Head, Mathematical Biosciences 44, 1979",
     "Walter2007": "B. Walter et al., Microfacet Models for Refraction through Rough Surfaces, EGSR 2007",
 }
