@@ -3,13 +3,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from whitefurnace import source
 from whitefurnace.catalogue import Integral, Model, integral, model
+from whitefurnace.catalogue.registry import CLOSED
 from whitefurnace.catalogue.rule import AVERAGE_RULES, LADDERS, Rule, gauss
 from whitefurnace.cells import CELLS_A_LAUNCH, over_nodes
 from whitefurnace.derived import Areas, numbers_of
@@ -30,6 +31,9 @@ LUCK = 5
 """What a rule is taken to gain on the one before at most; fewer cells than a block that agree at once are taken to be
 lucky too. Without both, one lone cell in ten states an error too small in float64, by up to 30 times; whole blocks pay
 next to nothing for it."""
+
+CLOSED_FROM = (1 / 512, 1e-8)
+"""The least n·v and tolerance of kernels with closed forms: nearer to grazing or finer the general ones are faster."""
 
 UNFINISHED = 3
 """Times its last change that the end of the ladder may be off where it did not converge: an error of first order in the
@@ -155,6 +159,7 @@ def demand(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresn
     slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
     shape = grid_of(entry, slots, dict(parameters), backfacing).shape
     digests = [_program(entry, some, 0).digest for some in summands_of(slots)]
+    digests += [source.closed(own, some).digest for some in summands_of(slots) if (own := own_kernel_of(entry, some))]
     if "ndf" in slots and slots["ndf"].model.isotropic:
         digests.append(source.area(slots["ndf"].model).digest)  # of the table, should it be needed
     components = 3 if "brdf" in slots else entry.components
@@ -318,11 +323,14 @@ class Part:
     entry: Integral
     slots: dict[str, Model]
     precision: int
+    closed: str | None = None  # the file of a kernel of its own
     areas: dict[int, Areas] = field(default_factory=dict)
     norms: tuple[float, float] = (np.inf, 0.0)
 
     @property
     def kind(self) -> str:
+        if self.closed:
+            return "light-angles"
         if "ndf" in self.slots:
             if self.entry.support == "ALL":
                 return "polar" if self.slots["ndf"].isotropic else "stretched"
@@ -331,7 +339,7 @@ class Part:
 
     @property
     def view(self) -> tuple[str, ...]:
-        return ("NoV",) if self.kind in ("gauss", "polar", "hemisphere") else ("NoV", "phi")
+        return ("NoV",) if self.kind in ("gauss", "polar", "hemisphere", "light-angles") else ("NoV", "phi")
 
     @property
     def components(self) -> int:
@@ -376,7 +384,8 @@ class Part:
         return cells.shape[1]
 
     def text(self, terms: int) -> str:
-        return _program(self.entry, self.slots, terms).text
+        return (source.closed(self.closed, self.slots) if self.closed else
+                _program(self.entry, self.slots, terms)).text
 
     def sum(self, cells: np.ndarray, terms: int, rule: Rule, precision: int) -> np.ndarray:
         return over_nodes(self.device, self.text(terms), "integrate", cells, self.components, precision, rule)
@@ -387,6 +396,14 @@ def _program(entry: Integral, slots: Mapping[str, Model], terms: int) -> source.
     if "ndf" in slots:
         return source.integration(integral("albedo") if entry.name == "albedo_average" else entry, slots, terms)
     return source.hemisphere(next(iter(slots.values())))
+
+
+def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
+    """The kernel that an integral has of its own for these models, if it has one."""
+    if "ndf" not in slots or any(m.text is not None for m in slots.values()):
+        return None
+    names = [m.name for m in slots.values()]
+    return CLOSED.get((entry.name, names[0], names[1])) if len(names) == 2 else None
 
 
 def summands_of(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
@@ -475,7 +492,15 @@ def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
 
 
 def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, tally: Tally) -> np.ndarray:
-    """`climb`, and infinity where a diffuse albedo is infinite at n·v = 0, as its closed form says (Minnaert's)."""
+    """`climb`, by a kernel of its own where there is one for these models, and infinity where a diffuse albedo is
+    infinite at n·v = 0, as its closed form says (Minnaert's)."""
+    own_kernel, far = own_kernel_of(part.entry, part.slots), rows[0] >= CLOSED_FROM[0]
+    if own_kernel and tolerance >= CLOSED_FROM[1] and far.any():
+        values = np.empty((part.components, rows.shape[1]))
+        values[:, far] = climb(replace(part, closed=own_kernel), rows[:, far], tolerance, tally)
+        if not far.all():
+            values[:, ~far] = climb(part, rows[:, ~far], tolerance, tally)
+        return values
     along = np.flatnonzero(rows[0] == 0) if "diffuse" in part.slots else np.empty(0, int)
     closed = part.slots["diffuse"].reference.get("albedo") if along.size else None
     if closed is None:

@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from whitefurnace import bilinear
 from whitefurnace.catalogue import integral
 from whitefurnace.device import Device, choose_device
+from whitefurnace.energy import KINDS, fresnel_demand
 from whitefurnace.environments import environment as load
-from whitefurnace.errors import FileError, UsageError, nearest
+from whitefurnace.errors import FileError, UnsupportedError, UsageError, nearest
 from whitefurnace.files import (
     Transaction,
     digest_file,
@@ -36,7 +38,9 @@ from whitefurnace.version import VERSION
 
 SIZE = 128
 SIZES = (1, 16384)
-SCALES = ("linear", "log", "centres")
+SCALES = ("linear", "log", "centres", "sqrt")
+FITS = ("bilinear",)
+FITTED = (2, 512)
 CHANNELS = {1: ("Y",), 2: ("R", "G"), 3: ("R", "G", "B")}
 FORMS = (".npy", ".exr")
 OPTIONS = frozenset(inspect.signature(integrate).parameters) - {"parameters"}
@@ -46,9 +50,10 @@ OPTIONS = frozenset(inspect.signature(integrate).parameters) - {"parameters"}
 class Axis:
     """A dimension of a table: `count` values of a parameter from `low` to `high`.
 
-    The scale "linear" and "log" have the first value at `low` and the last at `high`; "centres" has value k at
-    low + (k + ½)(high - low)/count, where a texture is read. `NoV` is the cosine of the view angle, `roughness` the
-    perceptual roughness that every model with a roughness follows, all else a parameter of the models.
+    The scales "linear", "log" and "sqrt" have the first value at `low` and the last at `high`, "sqrt" in equal steps of
+    the root of what is above `low`; "centres" has value k at low + (k + ½)(high - low)/count, where a texture is read.
+    `NoV` is the cosine of the view angle, `roughness` the perceptual roughness that every model with a roughness
+    follows, all else a parameter of the models.
     """
 
     name: str
@@ -62,7 +67,17 @@ class Axis:
             return self.low + (np.arange(self.count) + 0.5) * ((self.high - self.low) / self.count)
         if self.scale == "log":
             return np.geomspace(self.low, self.high, self.count)
+        if self.scale == "sqrt":
+            return self.low + (self.high - self.low) * np.linspace(0, 1, self.count) ** 2
         return np.linspace(self.low, self.high, self.count)
+
+    def at(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values and texel coordinates (0 is the first value) at shares in [0, 1] of the axis as it is read."""
+        if self.scale == "log":
+            values = self.low * (self.high / self.low) ** share
+        else:
+            values = self.low + (self.high - self.low) * (share**2 if self.scale == "sqrt" else share)
+        return values, share * self.count - 0.5 if self.scale == "centres" else share * (self.count - 1)
 
     def canonical(self) -> dict[str, Any]:
         return {"name": self.name, "from": self.low, "to": self.high, "count": self.count, "scale": self.scale}
@@ -71,6 +86,17 @@ class Axis:
         if self.scale == "centres" and (self.low, self.high) == (0.0, 1.0):
             return f"{self.name} = (k + ½)/{self.count}"
         return f"{self.name} = {self.low:g} … {self.high:g}, {self.count} {self.scale}"
+
+
+@dataclass(frozen=True)
+class Points:
+    """Values of a parameter that are no axis of the table."""
+
+    name: str
+    given: np.ndarray
+
+    def values(self) -> np.ndarray:
+        return self.given
 
 
 def axis(name: str, given: str | Sequence[Any] | Axis) -> Axis:
@@ -128,6 +154,9 @@ class Order:
     backfacing: str | None
     precision: int
     tolerance: float
+    fit: str | None
+    as_read: bool
+    scheme: str | None
     force: bool
     columns: Mapping[str, np.ndarray]
     demand: Demand
@@ -156,7 +185,8 @@ class Order:
         return {"integral": self.kind, "models": {slot: c.canonical() for slot, c in self.demand.slots.items()},
                 "parameters": dict(self.fixed), "axes": [a.canonical() for a in self.axes],
                 "backfacing": self.backfacing, "precision": self.precision, "tolerance": self.tolerance,
-                **self.around, "format": self.path.suffix.lower()}
+                **({"fit": self.fit} if self.fit else {}), **({"as_read_stated": True} if self.as_read else {}),
+                **({"scheme": self.scheme} if self.scheme else {}), **self.around, "format": self.path.suffix.lower()}
 
     def key(self) -> str:
         """sha256 over the recipe, the kernels and the version."""
@@ -183,10 +213,15 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
           fresnel: Spec | None = None, diffuse: Spec | None = None, brdf: Spec | None = None,
           light: Spec | None = None, environment: Any = None, normal: Sequence[float] | None = None,
           rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse", backfacing: str | None = None,
-          precision: int = 32, tolerance: float | None = None, force: bool = False,
+          precision: int = 32, tolerance: float | None = None, fit: str | None = None, as_read: bool = False,
+          scheme: str | None = None, force: bool = False,
           parameters: Mapping[str, Any] | None = None, **fixed: Any) -> Order:
     """A validated table; see `lut`. Raises UsageError, UnsupportedError, and what a user's file raises."""
-    entry = integral(kind)
+    own = KINDS.get(kind)
+    scheme = own.scheme_of(scheme) if own else scheme
+    if own is None and scheme is not None:
+        raise UsageError(f"{kind} has no scheme; energy has")
+    entry = integral(own.integral(scheme) if own else kind)
     path = Path(path)
     form = path.suffix.lower()
     if form not in FORMS:
@@ -199,31 +234,50 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
     tolerance = usual[precision] if tolerance is None else tolerance
     if not is_number(tolerance) or not 0 < tolerance < 1:  # also NaN
         raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
-    if ndf is None and diffuse is None and brdf is None:
-        ndf = "ggx"
-    if ndf is None and (masking is not None or fresnel is not None):
+    lone = own is not None and own.slot == "fresnel"
+    if lone and not (ndf is None and masking is None and diffuse is None and brdf is None):
+        raise UnsupportedError(f"{kind} is of Fresnel's term alone: give a fresnel, and no ndf, masking, diffuse or "
+                               "brdf")
+    if own and not lone and not (fresnel is None and diffuse is None and brdf is None):
+        raise UnsupportedError(f"{kind} is of an NDF and its masking; Fresnel's term is 1, and nothing else is added")
+    if ndf is None and diffuse is None and brdf is None and not lone:
+        ndf = own.model if own else "ggx"
+    if ndf is None and not lone and (masking is not None or fresnel is not None):
         raise UsageError(f"{'masking' if masking is not None else 'fresnel'} is of an NDF, and none is given")
     given = {"ndf": ndf, "masking": masking or "smith", "fresnel": fresnel or "one", "diffuse": diffuse, "brdf": brdf}
+    if lone:
+        given = {"fresnel": fresnel or own.model}  # type: ignore[union-attr]
     # Chosen once: a user's file is read once, and what was read is what the key is of.
     models = {slot: chosen(slot, spec) for slot, spec in given.items() if spec is not None}
     numbers = {name: _number(name, value) for name, value in {**(parameters or {}), **fixed}.items()}
-    explicit = {name: axis(name, given) for name, given in (axes or {}).items()}
-    for name in (*numbers, *explicit):
+    if lone and not axes:
+        axes = _usual(models["fresnel"], numbers, _sizes(size)[0])
+    scaled = {name: given for name, given in (axes or {}).items() if given in SCALES}  # a default axis, scaled
+    explicit = {name: axis(name, given) for name, given in (axes or {}).items() if name not in scaled}
+    for name in (*numbers, *explicit, *scaled):
         if name in OPTIONS:
             raise UsageError(f"{name} is an option and no parameter; a model's own of that name is SLOT_{name}")
-    placed = _placed(entry.view, models, _sizes(size), explicit, numbers)
+    placed = _placed(entry.view, models, _sizes(size), explicit, numbers, scaled)
     if form == ".exr" and len(placed) > 2:
         raise UsageError(f"EXR holds two axes, not {len(placed)}: give .npy")
     if not placed:
         raise UsageError("a table has an axis at least, and every parameter is given as a number")
+    if fit is not None and fit not in FITS:
+        raise UsageError(f"unknown fit {fit!r}{nearest(str(fit), FITS)}")
+    as_read = as_read or fit is not None
+    if as_read and not (len(placed) == 2 and all(FITTED[0] <= a.count <= FITTED[1] for a in placed)):
+        raise UsageError(f"what is read between texels is told of tables with two axes of {FITTED[0]} to {FITTED[1]}")
     columns = _columns(placed, models, numbers)
     lit, around = _lit(kind, light, environment, normal, rotate, exposure, nonfinite)
     what: dict[str, Any] = {**models, **columns, "backfacing": backfacing}
-    asked = radiance_demand(light=lit.get("light"), **what) if lit else demand(kind, **what)
+    asked = (fresnel_demand(models, columns) if lone else radiance_demand(light=lit.get("light"), **what) if lit else
+             demand(entry.name, **what))
+    if own and not lone:
+        asked = replace(asked, shape=(*asked.shape[:len(np.broadcast_shapes(*map(np.shape, columns.values())))], 2))
     if form == ".exr" and asked.shape[2:] and asked.shape[2] not in CHANNELS:
         raise UsageError(f"EXR holds 1 to 3 channels, not {asked.shape[2]}")
-    return Order(kind, path, models, placed, numbers, backfacing, precision, float(tolerance), force, columns, asked,
-                 lit, around)
+    return Order(kind, path, models, placed, numbers, backfacing, precision, float(tolerance), fit, as_read, scheme,
+                 force, columns, asked, lit, around)
 
 
 def _lit(kind: str, light: Spec | None, around: Any, normal: Sequence[float] | None, rotate: float, exposure: float,
@@ -248,6 +302,15 @@ def _lit(kind: str, light: Spec | None, around: Any, normal: Sequence[float] | N
         "nonfinite": nonfinite, "normal": list(up)}}
 
 
+def _usual(choice: Chosen, fixed: Mapping[str, float], count: int) -> dict[str, Axis]:
+    """An axis over the first parameter of a model that has no value: its domain where that ends at 1, else from the
+    least to the largest of its typical values."""
+    free = [p for p in choice.model.parameters if p.default is None and p.name not in choice.given
+            and not {p.name, f"{choice.model.slot}_{p.name}"} & set(fixed)]
+    ends = {p.name: (p.low, p.high) if p.high <= 1 else (min(p.typical), max(p.typical)) for p in free[:1]}
+    return {name: Axis(name, *both, count) for name, both in ends.items()}
+
+
 def _number(name: str, value: Any) -> float:
     try:
         number = float(value)
@@ -261,7 +324,7 @@ def _number(name: str, value: Any) -> float:
 
 
 def _placed(view: bool, models: Mapping[str, Chosen], sizes: tuple[int, int, bool], explicit: Mapping[str, Axis],
-            fixed: Mapping[str, float]) -> tuple[Axis, ...]:
+            fixed: Mapping[str, float], scaled: Mapping[str, str] | None = None) -> tuple[Axis, ...]:
     """The axes in their order, x first: NoV where there is a view, roughness where some model's follows it and is not
     given, each unless it is fixed and as given where it is; then the others."""
     for name in explicit:
@@ -274,6 +337,12 @@ def _placed(view: bool, models: Mapping[str, Chosen], sizes: tuple[int, int, boo
     taken = {*explicit, *fixed}
     if "roughness" not in fixed and any(_following(choice, taken) for choice in models.values()):
         defaults["roughness"] = Axis("roughness", 0.0, 1.0, down, "centres")
+    for name, scale in (scaled or {}).items():
+        if name not in defaults:
+            raise UsageError(f"axis {name}: there is no default axis of that name to scale; give A:B:N:{scale}")
+        if scale == "log":
+            raise UsageError(f"axis {name}: a log scale needs ends above 0; give A:B:N:log")
+        defaults[name] = replace(defaults[name], scale=scale)
     if both:
         for name, count in (("NoV", across), ("roughness", down)):
             if name not in defaults or name in explicit:
@@ -292,7 +361,8 @@ def _following(choice: Chosen, taken: Any) -> list[str]:
             (name not in taken or name == "roughness")]
 
 
-def _columns(axes: Sequence[Axis], models: Mapping[str, Chosen], fixed: Mapping[str, float]) -> dict[str, np.ndarray]:
+def _columns(axes: Sequence[Axis | Points], models: Mapping[str, Chosen],
+             fixed: Mapping[str, float]) -> dict[str, np.ndarray]:
     """What `integrate` is told: numbers, and arrays that broadcast to […, y, x]."""
     dimensions = max(len(axes), 2)  # [y, x] at least
     columns = {name: np.array(value) for name, value in fixed.items()}
@@ -325,10 +395,12 @@ def lut(kind: str, path: str | os.PathLike[str], *, device: Device | str | None 
         progress: Progress | None = None, **options: Any) -> Table:
     """Writes a table of any integral to `path` (.npy or .exr), and beside it `path.json`, last, which proves it whole.
 
-    options: size (N, (N, M) or "NxM"; 128), axes ({name: (A, B, N[, "linear" | "log" | "centres"])}), ndf (`ggx`
-    unless there is a diffuse or brdf), masking, fresnel, diffuse, brdf, backfacing, precision, tolerance, force, for
-    radiance light or environment, normal, rotate, exposure, nonfinite, and parameters, as one number each, by name or
-    as a mapping.
+    kind is an integral's name, "energy" (what multiple scattering gives back, `scheme` "kulla_conty", "turquin" or
+    "fdez_aguera"), "sheen" or "fresnel_average". options: size (N, (N, M) or "NxM"; 128), axes ({name: (A, B, N[,
+    "linear" | "log" | "centres" | "sqrt"])}, or a scale alone for a default axis), fit ("bilinear": texels that read
+    best, of two axes), as_read (state errors between texels; a fit does), ndf (`ggx` unless there is a diffuse or
+    brdf), masking, fresnel, diffuse, brdf, backfacing, precision, tolerance, force, for radiance light or environment,
+    normal, rotate, exposure, nonfinite, and parameters, as one number each, by name or as a mapping.
 
     The array is […, y, x(, c)] of float32 or float64. x is NoV = (x + ½)/N for integrals with a view, y perceptual
     roughness r = (y + ½)/M, row 0 smoothest, which the models' own parameters follow; without a view r alone is x. A
@@ -361,6 +433,7 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
         return plain
     on = device if isinstance(device, Device) else choose_device(device)
     made: list[Integrated] = []
+    told: dict[str, Any] = {}
 
     def fill(out: np.ndarray) -> None:
         def tell(share: float) -> None:
@@ -368,18 +441,21 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
             if progress:
                 progress(request.path.name, "cells", share)
 
-        what: dict[str, Any] = {**request.models, **request.lit, **request.columns}
-        result = integrate(request.kind, backfacing=request.backfacing, device=on, precision=request.precision,
-                           tolerance=request.tolerance, out=out, progress=tell, **what)
+        if request.fit:
+            result = _fitted(request, on, out, told)
+        else:
+            result = _values(request, on, request.columns, request.tolerance, told, out, tell)
+        if request.as_read:
+            told["as_read"] = _as_read(request, on, out)
         made.append(replace(result, values=np.empty(0)))  # the file has them; what is held would keep it mapped
 
     with Transaction() as transaction:
         if request.path.suffix.lower() == ".npy":
             write_npy(request.path, request.shape, request.dtype, fill, into=transaction)
         else:
-            _exr(request, key, fill, made, transaction)
+            _exr(request, key, fill, made, told, transaction)
         staged = transaction.staged(request.path)
-        manifest = _manifest(request, key, on, made[0])
+        manifest = {**_manifest(request, key, on, made[0]), **told}
         manifest |= {"sha256": digest_file(staged), "bytes": staged.stat().st_size}
         write_manifest(request.manifest_path, manifest, into=transaction)
         transaction.commit()
@@ -387,17 +463,72 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
                    seconds=time.perf_counter() - begin)
 
 
+def _values(request: Order, on: Device, columns: Mapping[str, np.ndarray], tolerance: float,
+            told: dict[str, Any] | None = None, out: np.ndarray | None = None,
+            progress: Callable[[float], None] | None = None) -> Integrated:
+    """The table's values at columns, […, c]; `told` is what is to be said of them."""
+    what: dict[str, Any] = {**request.models, **columns, "backfacing": request.backfacing, "device": on,
+                            "precision": request.precision, "tolerance": tolerance, "out": out}
+    if request.kind in KINDS:
+        result, facts = KINDS[request.kind].make(request.scheme, told is not None, **what)
+        if told is not None:
+            told |= facts
+        return result
+    return integrate(request.kind, progress=progress, **request.lit, **what)
+
+
+def _at(request: Order, on: Device, shares: Sequence[np.ndarray], tolerance: float) -> tuple[Any, ...]:
+    """Values at shares of x and y, (ny, nx, c) float64, the weights of reads there along y and x, the rows that count,
+    and what was integrated."""
+    points, weights = [], []
+    for one, share in zip(request.axes, shares, strict=True):
+        values, x = one.at(share)
+        points.append(Points(one.name, values))
+        weights.append(bilinear.hats(one.count, x))
+    made = _values(request, on, _columns(points, request.models, request.fixed), tolerance)
+    down = points[1]
+    counted = down.given >= bilinear.LEAST if down.name == "roughness" else np.ones(down.given.size, bool)
+    truth = np.asarray(made.values, np.float64).reshape(down.given.size, points[0].given.size, -1)
+    return truth, weights[1], weights[0], counted if counted.any() else ~counted, made
+
+
+def _fitted(request: Order, on: Device, out: np.ndarray, told: dict[str, Any]) -> Integrated:
+    """Texels that read best between the axes' ends."""
+    shares = [np.concatenate([[0.0], (np.arange(n) + 0.5) / n, [1.0]])
+              for n in (bilinear.SAMPLES * a.count for a in request.axes)]
+    truth, down, across, counted, made = _at(request, on, shares, request.tolerance)
+    if request.kind in KINDS:
+        _values(request, on, request.columns, request.tolerance, told)
+    out[...] = bilinear.fit(truth, down, across, counted).reshape(out.shape)
+    return replace(made, values=out)
+
+
+def _as_read(request: Order, on: Device, out: np.ndarray) -> dict[str, Any]:
+    """Absolute errors at texel centres and of bilinear reads between them, from the table and as formats hold it."""
+    texels = np.asarray(out, np.float64).reshape(request.axes[1].count, request.axes[0].count, -1)
+    # Of points where no fit looked, and the ends.
+    shares = [np.concatenate([[0.0], (np.arange(n) + 0.37) / n, [1.0]]) for n in (5 * a.count for a in request.axes)]
+    truth, down, across, counted, _ = _at(request, on, shares, request.tolerance)
+    there = np.asarray(_values(request, on, request.columns, request.tolerance).values, np.float64)
+    rows = request.axes[1].values()
+    at = rows >= bilinear.LEAST if request.axes[1].name == "roughness" else np.ones(rows.size, bool)
+    return {"counted": f"roughness from {bilinear.LEAST}; max_all from the axis's end",
+            "centres": bilinear.errors(np.abs(texels - there.reshape(texels.shape)), at if at.any() else ~at),
+            "between": {name: bilinear.errors(np.abs(bilinear.read(held, down, across) - truth), counted)
+                        for name, held in bilinear.formats(texels, request.dtype).items()}}
+
+
 def _exr(request: Order, key: str, fill: Callable[[np.ndarray], None], made: list[Integrated],
-         transaction: Transaction) -> None:
+         told: dict[str, Any], transaction: Transaction) -> None:
     """By way of a file without a name, so that a large table needs little memory."""
     channels = request.shape[2] if len(request.shape) == 3 else 1
     with scratch(request.path, request.shape, request.dtype, fill) as cells:
-        told = {f"whitefurnace:{name}": value if isinstance(value, str | float) else
+        texts = {f"whitefurnace:{name}": value if isinstance(value, str | float) else
                 json.dumps(value, sort_keys=True, ensure_ascii=False)
-                for name, value in _manifest(request, key, None, made[0]).items()
+                for name, value in {**_manifest(request, key, None, made[0]), **told}.items()
                 if name not in ("name", "whitefurnace")}
         write_exr(request.path, cells.reshape(*request.shape[:2], channels), channel_names=CHANNELS[channels],
-                  attributes={"whitefurnace:version": VERSION, **told}, into=transaction)
+                  attributes={"whitefurnace:version": VERSION, **texts}, into=transaction)
 
 
 def _manifest(request: Order, key: str, device: Device | None, made: Integrated) -> dict[str, Any]:

@@ -52,6 +52,9 @@ INTEGRALS = {
     )
 }
 
+CLOSED = {("dfg", "ggx", "smith"): "dfg_ggx.cl", ("dfg", "ggx", "smith_separable"): "dfg_ggx.cl"}
+"""Integrals that have a kernel of their own for a pair of NDF and masking, by closed forms that others do not have."""
+
 LOBE = Integral("lobe", "The prefilter's lobe", 1, ("NDF_D",), "LOBE", False,
                 "∫ K dω of K(l·r) = D(h)(n·l) with n = v = r")
 

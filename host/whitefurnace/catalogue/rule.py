@@ -17,7 +17,7 @@ def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
 @dataclass(frozen=True)
 class Rule:
     """A product of Gauss rules: nodes in the two polar panels (`near`, `far`; 0 near where there is one) and in each
-    of `panels` azimuth panels."""
+    of `panels` azimuth panels. Of `light-angles` the panels are polar, and the azimuths midpoints of a quarter turn."""
 
     family: str
     near: int
@@ -40,7 +40,11 @@ class Rule:
         return (self.near, self.near + self.far) if self.near else (self.far,)
 
     def tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """Polar nodes (near + far, 2) and azimuth nodes (azimuths, 2), as (x, w) pairs in float64."""
+        """Polar nodes (near + far, 2) and azimuth nodes (azimuths, 2), as (x, w) pairs in float64; of `light-angles`
+        the azimuths are (sin, 1 - sin) instead, whose weights are equal."""
+        if self.family == "light-angles":
+            left = (self.azimuths - 0.5 - np.arange(self.azimuths)) * (np.pi / 2 / self.azimuths)
+            return np.stack(gauss(self.far), 1), np.stack([np.cos(left), 2 * np.sin(left / 2) ** 2], 1)
         pairs = [np.stack(gauss(n), 1) for n in (self.near, self.far, self.azimuths) if n]
         return np.concatenate(pairs[:-1]), pairs[-1]
 
@@ -56,6 +60,9 @@ LADDERS = {
     # ring.clh: an NDF of the polar angle
     "gauss": _ladder("gauss", 1, (10, 16, 8), (12, 24, 10), (16, 32, 12), (20, 36, 16), (24, 40, 18), (32, 48, 24),
                      (40, 64, 26), (56, 88, 32), (80, 120, 48), (112, 168, 64), (160, 240, 96)),
+    # dfg_ggx.cl: three panels over the light's polar angle, an azimuth in closed form but for Schlick's part
+    "light-angles": _ladder("light-angles", 3, (0, 10, 9), (0, 12, 10), (0, 14, 11), (0, 18, 13), (0, 22, 16),
+                            (0, 28, 24), (0, 36, 36), (0, 48, 64)),
     # ring.clh without an azimuth: normalization
     "polar": _ladder("polar", 1, (12, 12, 1), (16, 18, 1), (20, 24, 1), (28, 32, 1), (40, 44, 1), (56, 64, 1),
                      (80, 88, 1), (112, 128, 1), (168, 192, 1), (256, 288, 1)),
