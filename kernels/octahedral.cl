@@ -267,6 +267,8 @@ __kernel void unfold(__global float *restrict level, const int stride, const int
         const int o = g * W + l;
         if (o >= count) continue;
         const int a = number[2 * o], b = number[2 * o + 1];
+        // On a mirror plane of an odd cube two reflections are one: the one that leaves the coordinate alone writes.
+        if (!latlong && (((t & 1) && a == 0) || ((t & 2) && b == 0))) continue;
         // An output on a mirror plane between two axes has each image twice: by even exchanges alone, once.
         const int twice = latlong ? 8 * b == 4 * size : a == b;
         if (twice && (latlong ? e == 1 : e == 1 || e >= 4)) continue;

@@ -21,11 +21,13 @@ import OpenImageIO as oiio
 import pytest
 
 from reference import cube_directions
-from whitefurnace import bake, dfg, prefilter
+from whitefurnace import bake, baking, dfg, prefilter
 from whitefurnace.cli import main
+from whitefurnace.device import Device
 from whitefurnace.environments import cube_solid_angles
 from whitefurnace.errors import UsageError
 from whitefurnace.files import Transaction, write_exr
+from whitefurnace.recipe import chain
 
 SMALL = ("--size", "32", "--min-size", "8")
 SIZES = dict(size=32, min_size=8)
@@ -910,3 +912,15 @@ def test_a_tolerance_out_of_reach_fails_the_check_and_writes_nothing(tmp_path, s
     monkeypatch.setattr("whitefurnace.plan.LARGEST_GRID", 16)
     assert shell("bake", source, "-o", tmp_path / "out", *SMALL, "--tolerance", "1e-5") == 7
     assert "1e-05" in shell.sentence() and tree(tmp_path / "out") == {}
+
+
+@pytest.mark.parametrize("options", [{}, {"samples": 16}, {"size": 64, "min_size": 16, "levels": 9}], ids=str)
+def test_every_kernel_of_a_bake_is_in_its_key(tmp_path, device, monkeypatch, options):
+    """A bake is skipped on the word of its key: whatever text made it must be part of that."""
+    built, build = set(), Device.build
+    monkeypatch.setattr(Device, "build", lambda self, text, *rest: (built.add(text), build(self, text, *rest))[1])
+    monkeypatch.setattr(baking, "_table", lambda *_: dfg(baking.DFG_SIZE, device=device))
+    bake(noise(), tmp_path / "out", device=device, **{**SIZES, **options})
+    known = baking._kernel_digests("latlong", baking._Held.of(chain().ndf))
+    unknown = [text[:60] for text in built if hashlib.sha256(text.encode()).hexdigest() not in known]
+    assert built and not unknown

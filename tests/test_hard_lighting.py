@@ -20,10 +20,11 @@ from whitefurnace.environments import cube_solid_angles
 
 Density = Callable[[np.ndarray], np.ndarray]
 
+# With sin²θ beside cos θ: from the cosine alone float32 keeps two digits of it at α = .004.
 MINE = """// A lobe of two tails.
-real ndf_mine_D(real cos_m, real alpha) {
-  const real a2 = alpha * alpha, s = (1 - cos_m) * (1 + cos_m);
-  return 1 / (a2 + s) + 1 / sqr(a2 + s);
+real ndf_mine_D(real cos_m, real sin2_m, real alpha) {
+  const real a2 = alpha * alpha;
+  return 1 / (a2 + sin2_m) + 1 / sqr(a2 + sin2_m);
 }
 """
 
@@ -62,6 +63,7 @@ def where(x: float, y: float, z: float) -> tuple[int, int]:
 
 SOURCES = {
     "noise": lambda: noise(32, 64),
+    "fine noise": lambda: noise(128, 256),
     "odd rows": lambda: noise(37, 74),
     "odd and few": lambda: noise(9, 18),
     "one texel": lambda: noise(1, 1),
@@ -89,7 +91,7 @@ def check(device: Device, ndf: str, source: str, path: Path, texels: int, rotate
         (path / "mine.clh").write_text(MINE)
     chain = prefilter(pixels, ndf=str(path / "mine.clh") if ndf == "mine" else ndf, rotate=rotate, device=device,
                       **{**CHAIN, **options})  # type: ignore[arg-type]
-    assert (chain.error[1:] <= 1e-3).all(), (ndf, source, chain.error)
+    assert (chain.error[1:] <= options.get("tolerance", 1e-3)).all(), (ndf, source, chain.error)
     rng = np.random.default_rng([len(ndf), *source.encode()])
     brightest = reference.texel_nodes(pixels, math.radians(rotate), 1)[0][pixels.reshape(-1, 3).max(1).argmax()]
     for k, (r, values) in enumerate(zip(chain.roughness, chain.values, strict=True)):
@@ -149,7 +151,7 @@ def test_every_source(device: Device, tmp_path: Path, source: str) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize("source", [name for name in SOURCES if name != "fine noise"])
 @pytest.mark.parametrize("ndf", NDFS)
 def test_every_ndf_of_every_source(device: Device, tmp_path: Path, ndf: str, source: str) -> None:
     check(device, ndf, source, tmp_path, 12)
@@ -158,8 +160,9 @@ def test_every_ndf_of_every_source(device: Device, tmp_path: Path, ndf: str, sou
 @pytest.mark.long
 @pytest.mark.parametrize("ndf", ["ggx", "beckmann", "gtr:gamma=1.5"])
 def test_the_sharpest(device: Device, tmp_path: Path, ndf: str) -> None:
-    """α = 1.07e-3 is the second of 32 levels; the grid is the finest there is."""
-    check(device, ndf, "noise", tmp_path, 12, levels=32, size=4, min_size=4)
+    """α = 1.07e-3 is the second of 32 levels; the grid is the finest there is, and leaves more than 1e-3 of noise
+    whose texels are 23 α wide."""
+    check(device, ndf, "fine noise", tmp_path, 6, levels=32, size=4, min_size=4, tolerance=3e-3)
 
 
 @pytest.mark.parametrize("source", ["noise", "sun on an edge"])

@@ -107,3 +107,17 @@ def test_an_environment_is_known_by_what_was_applied_to_it(tmp_path, device: Dev
 
 def test_an_array_can_be_baked(tmp_path, device: Device):
     assert bake(noise(), tmp_path, device=device, **SMALL)[0].name == "array"
+
+
+def test_an_odd_irradiance_cube_holds_a_sun_once(device: Device):
+    """Of an odd size the middle rows of faces lie on mirror planes: two or four images of an output are one texel. From
+    135² on the level is read from nodes and the sun is added to it."""
+    pixels = noise(2)
+    pixels[9, 20] = 3000
+    made = irradiance(pixels, size=151, device=device)
+    assert made.rule == irradiance(pixels, size=32, device=device).rule  # no refinement hides it
+    rows = made.values[:, 75].reshape(-1, 3), made.values[:, :, 75].reshape(-1, 3)
+    beside = made.values[:, 74].reshape(-1, 3), made.values[:, :, 74].reshape(-1, 3)
+    for on, off in zip(rows, beside, strict=True):
+        # Neighbours .01 rad apart: E changes by at most .01 of its largest value a step.
+        assert np.abs(on - off).max() <= 0.011 * made.values.max()

@@ -319,7 +319,8 @@ def _kernel_digests(kind: str, ndf: _Held) -> tuple[str, ...]:
     """The digests of every kernel that a bake of a source of this kind may run."""
     slots = {"ndf": ndf.choice.model, "masking": model("masking", "smith")}
     texts = [source.texels(kind), source.overlap(), source.convolution(ndf.choice.model), source.convolution(None),
-             source.samples(),
+             source.samples(), source.octahedral(), source.apart(ndf.choice.model), source.apart(None),
+             source.interpolation(), source.near_texels(kind, ndf.choice.model),
              source.integration(INTEGRALS["dfg"], slots)]
     if own := own_kernel_of(INTEGRALS["dfg"], slots):
         texts.append(source.closed(own, slots))

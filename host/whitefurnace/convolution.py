@@ -23,7 +23,7 @@ from whitefurnace.texels import Texels
 Progress = Callable[[str, float], None]
 """Called with what is being done and its share of the whole, 0 to 1."""
 
-# What a certified error may hide of rounding: float32 leaves up to 3e-5 on the darkest texels of a studio and a
+# What a certified error may hide of rounding: float32 leaves up to 2e-5 on the darkest texels of a studio and a
 # tenth of that in the median, measured against float64 in another form (tests/test_prefilter_kernels.py).
 ROUNDING = {32: 2e-5, 64: 2e-7}
 
@@ -33,6 +33,9 @@ SERIES = {32: 3e-7, 64: 3e-8}
 NEAR_TEXELS = 12.0
 """Parts of texels, as masses at corrected centres resolve them, within which those are cut finely that a lobe much
 narrower than a texel needs."""
+
+MOST_TOGETHER = 4096
+"""Directions of exact integrals at a time: bounds memory, and a launch to a second."""
 
 HARMONICS_CHUNK = 1024
 EXACT_SHARE = 0.3  # of the progress: the certificate's sums come first and take about this part of the time
@@ -79,8 +82,8 @@ class Convolver:
         self.texel, self.share = self.texels.texel, self.texels.share
         self.overlaps = Means(device, self.texels.values, environment.rotation, self.texels.radiance)
         self._symmetries = octahedral_of(device, self.precision)
-        self._classes: dict[tuple[int, int], Classes] = {}
-        self._lists: dict[int, Buffer] = {}
+        self._classes: dict[tuple[int, ...], Classes] = {}  # by exchanges too
+        self._lists: dict[tuple[int, ...], Buffer] = {}  # by nodes an edge and what they were made from
         self._harmonics: dict[int, np.ndarray] = {}  # 9 × 3 coefficients and ∑w, by cuts
 
     def prepare(self, n: int, cuts: int) -> None:
@@ -92,19 +95,19 @@ class Convolver:
 
     def _sources(self, n: int, exchanges: int) -> Classes:
         """The classes of a grid."""
-        if (n, exchanges) not in self._classes:
-            self._classes[n, exchanges] = self._symmetries.classes(n, self.texels.grid(n), exchanges)
-        return self._classes[n, exchanges]
+        grid = self.texels.grid(n)
+        key = (n, exchanges, *self.texels.fineness)
+        if key not in self._classes:
+            self._classes = {k: v for k, v in self._classes.items() if k[2:] == key[2:]}
+            self._classes[key] = self._symmetries.classes(n, grid, exchanges)
+        return self._classes[key]
 
     def convolve(self, lobe: Lobe, shape: Shape, n: int, tolerance: float,
                  share: tuple[float, ...] = (0.0, 1.0)) -> np.ndarray:
         """The level over all directions of `shape` from the n × n grid and the bright texels, (dims, 3)."""
         if n % 16:
             raise ValueError(f"a grid of {n} nodes an edge is not a multiple of the tiles' 16")
-        before = self.texels.fineness
         self.prepare(n, planning.cuts_for(self.texel, lobe.alpha, tolerance, self.share, self.texels.centred))
-        if self.texels.fineness != before:
-            self._classes.clear()
         s, error = self._symmetries, max(SERIES[self.precision], tolerance / 300)
         bright = self.texels.bright_list(lobe, tolerance)
         nodes = planning.output_nodes(n, lobe.alpha)
@@ -167,7 +170,13 @@ class Convolver:
         Bright texels are cut twice as fine as in `convolve`. The spherical harmonics of the same nodes
         are kept where `harmonics` will ask for them.
         """
-        coarse = self.texels.centred and cuts > max(planning.CENTRED)
+        if any(directions.shape[1] > MOST_TOGETHER for _, directions in wanted):  # of a certificate of many texels
+            pieces = [np.array_split(directions, -(-directions.shape[1] // MOST_TOGETHER), 1)
+                      for _, directions in wanted]
+            return [np.concatenate([self.exact([(lobe, piece)], cuts, tolerance)[0] for piece in some])
+                    for (lobe, _), some in zip(wanted, pieces, strict=True)]
+        # What lies beyond the window of narrow lobes errs by up to 3e-5.
+        coarse = self.texels.centred and cuts > max(planning.CENTRED) and tolerance >= 1e-4
         if wanted and coarse and all(_narrow(lobe) for lobe, _ in wanted):
             return [self.exact_narrow(lobe, directions, cuts, tolerance) for lobe, directions in wanted]
         jobs = [(lobe, self._directions(directions)) for lobe, directions in wanted]
@@ -209,10 +218,15 @@ class Convolver:
 
     def on_grid(self, lobe: Lobe, directions: np.ndarray, n: int, tolerance: float) -> np.ndarray:
         """As `exact` for one lobe, over the n × n grid instead of every texel."""
-        if n not in self._lists:
-            self._lists[n] = self.texels.grid_list(n)
+        if directions.shape[1] > MOST_TOGETHER:
+            pieces = np.array_split(directions, -(-directions.shape[1] // MOST_TOGETHER), 1)
+            return np.concatenate([self.on_grid(lobe, piece, n, tolerance) for piece in pieces])
+        grid = self.texels.grid(n)
+        key = (n, *self.texels.fineness)
+        if key not in self._lists:
+            self._lists[key] = self.texels.grid_list(n)
         block = self._directions(directions)
-        total = self._list_sums(lobe, self._lists[n], 6 * n * n, block)
+        total = self._list_sums(lobe, self._lists[key], 6 * grid.shape[1] ** 2, block)
         return self._value(lobe, block, total, tolerance, directions.shape[1])
 
     def _directions(self, directions: np.ndarray) -> Buffer:

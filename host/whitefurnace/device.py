@@ -542,11 +542,10 @@ class Device:
         The local size is `(self.local_size, 1, …)` by default, and the first global size a multiple of it.
         Raises DeviceError where the runtime refuses; a failure while running is raised by a later call.
         """
-        if local_size is None:
-            first = self.local_size
-            while first > kernel.work_group_limit:
-                first //= 2
-            local_size = (first, *(1,) * (len(global_size) - 1))
+        first, *rest = local_size or (self.local_size, *(1,) * (len(global_size) - 1))
+        while first > max(kernel.work_group_limit, 1):  # halves still divide a padded global size
+            first //= 2
+        local_size = (first, *rest)
         if any(n % m or n < 1 for n, m in zip(global_size, local_size, strict=True)):
             raise DeviceError(f"kernel {kernel.name}: the global size {global_size} is not a multiple of the "
                               f"local size {local_size}")

@@ -96,9 +96,9 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) ->
             lobe = mixture_lobe(convolver.device, recipe.ndf, mixture, recipe.parameters)
         elif level.roughness > 0:
             lobe = ndf_lobe(convolver.device, recipe.ndf, level.roughness, level.parameters)
-        if lobe and level.grid and (mixture or lobe.horizon > lobe.alpha):  # other than GGX's own
+        if lobe and (mixture or lobe.horizon > lobe.alpha):  # other than GGX's own
             grid = planning.grid_size(lobe.alpha, recipe.tolerance, max(lobe.horizon, lobe.alpha))
-            level = replace(level, grid=max(level.grid, grid), cuts=max(level.cuts, planning.cuts_for(
+            level = replace(level, grid=level.grid and max(level.grid, grid), cuts=max(level.cuts, planning.cuts_for(
                 convolver.texel, lobe.alpha, recipe.tolerance, convolver.share, convolver.texels.centred)))
         jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size)))
     return jobs
