@@ -369,9 +369,11 @@ def _check_writable(output: Path) -> None:
     try:
         output.mkdir(parents=True, exist_ok=True)
         probe = output / f".whitefurnace-{os.getpid()}.tmp"
-        with open(probe, "wb"):
-            pass
-        probe.unlink()
+        try:
+            with open(probe, "wb"):
+                pass
+        finally:  # Ctrl-C between the two would leave it there
+            probe.unlink(missing_ok=True)
     except OSError as error:
         raise FileError(f"cannot write into {output}: {error.strerror or error}") from error
 
