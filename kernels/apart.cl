@@ -20,11 +20,8 @@ __kernel void convolve_apart(__global scalar *restrict partial, const int output
       for (int k = 0; k < 3; k++) sum[u][k] = 0;
     for (int j = first; j < end; j++) {
       __global const scalar *p = source + 8 * (size_t)j;
-      const scalar px = p[ox], py = p[oy], pz = p[oz];
-      const real xm = sqr(x - px), xp = sqr(x + px), ym = sqr(y - py), yp = sqr(y + py), zm = sqr(z - pz),
-                 zp = sqr(z + pz);
-      const real u0 = ym + zm, u1 = yp + zm, u2 = ym + zp, u3 = yp + zp;
-      const real q[8] = {xm + u0, xp + u0, xm + u1, xp + u1, xm + u2, xp + u2, xm + u3, xp + u3};
+      real q[8];
+      mirror_distances(q, x, y, z, p[ox], p[oy], p[oz]);
       for (int u = 0; u < 8; u++) {
         const real K = lobe(q[u] NDF_VALUES);
         for (int k = 0; k < 3; k++) sum[u][k] += K * p[4 + k];

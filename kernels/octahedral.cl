@@ -77,13 +77,7 @@ __kernel void class_moments(__global scalar *restrict moment, const int n, __glo
   for (int e = 0; e < PERMS; e++) {
     QUAD v[8];
     for (int u = 0; u < 8; u++) v[u] = vload4(place_of(c, e, u, n, place), grid);
-    for (int bit = 1; bit < 8; bit *= 2)
-      for (int u = 0; u < 8; u++)
-        if (!(u & bit)) {
-          const QUAD a = v[u], b = v[u | bit];
-          v[u] = a + b;
-          v[u | bit] = a - b;
-        }
+    HADAMARD_8(QUAD, v)
     for (int p = 0; p < 8; p++) {
       __global scalar *m = moment + ((size_t)p * classes + c) * CHANNELS + 3 * e;
       m[0] = v[p].x; m[1] = v[p].y; m[2] = v[p].z;
@@ -113,12 +107,8 @@ static inline void add_classes(__global scalar *restrict out, int g, int outputs
   real K[8][RUN], weight = 0;
   for (int k = 0; k < count; k++) {
     __global const scalar *p = node + 4 * (size_t)(first + k);
-    const scalar px = p[0], py = p[1], pz = p[2];
-    const real xm = sqr(x - px), xp = sqr(x + px), ym = sqr(y - py), yp = sqr(y + py), zm = sqr(z - pz),
-               zp = sqr(z + pz);
-    const real u0 = ym + zm, u1 = yp + zm, u2 = ym + zp, u3 = yp + zp;
-    const real q[8] = {xm + u0, xp + u0, xm + u1, xp + u1, xm + u2, xp + u2, xm + u3, xp + u3};
-    real v[8];
+    real q[8], v[8];
+    mirror_distances(q, x, y, z, p[0], p[1], p[2]);
     lobe_of_8(v, q LOBE_VALUES);
     const real a0 = v[0] + v[1], a1 = v[0] - v[1], a2 = v[2] + v[3], a3 = v[2] - v[3];
     const real a4 = v[4] + v[5], a5 = v[4] - v[5], a6 = v[6] + v[7], a7 = v[6] - v[7];
@@ -248,13 +238,7 @@ __kernel void unfold(__global float *restrict level, const int stride, const int
       for (int n = 0; n < alls; n++)
         v[p] += LOAD(g, all + n * split_size + (size_t)(p * CHANNELS + 3 * e + k) * outputs);
     }
-    for (int bit = 1; bit < 8; bit *= 2)
-      for (int p = 0; p < 8; p++)
-        if (!(p & bit)) {
-          const real a = v[p], b = v[p | bit];
-          v[p] = a + b;
-          v[p | bit] = a - b;
-        }
+    HADAMARD_8(real, v)
     for (int t = 0; t < 8; t++) {
       real sum = v[t] / 8;
       for (int n = 0; n < closes; n++)

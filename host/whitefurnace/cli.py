@@ -235,20 +235,14 @@ def verify(specs: tuple[str, ...], precision: int | None, folder: Path | None, d
 
     from whitefurnace import report, verification
     from whitefurnace.device import choose_device
-    from whitefurnace.errors import CheckError, FileError, UsageError
+    from whitefurnace.errors import CheckError, UsageError
 
     start = time.perf_counter()
     if precision not in (None, *verification.PRECISIONS):
         raise UsageError(f"precision {precision} is not one of 32, 64")
     subjects = verification.subjects(specs)
     if folder is not None:
-        from whitefurnace import plots
-
-        plots.require()
-        try:
-            folder.mkdir(parents=True, exist_ok=True)  # before the work, not after it
-        except OSError as error:
-            raise FileError(f"{folder}: cannot be made: {error.strerror}") from None
+        _plots_into(folder)
     on = choose_device(device)
     both = verification.PRECISIONS if on.fp64 else (32,)
     if precision is None and not on.fp64 and not quiet:
@@ -268,6 +262,8 @@ def verify(specs: tuple[str, ...], precision: int | None, folder: Path | None, d
                     click.echo(report.VERIFY_HEAD)
                 click.echo(report.verify_text(shown))
     if folder is not None:
+        from whitefurnace import plots
+
         for path in plots.draw(folder, [subject.model for subject in subjects], rows, on):
             if as_json:
                 _json({"event": "plot", "file": str(path)})
@@ -357,7 +353,7 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
               device: str | None, dry_run: bool, as_json: bool) -> None:
     from whitefurnace import report, tradeoff
     from whitefurnace.device import choose_device
-    from whitefurnace.errors import FileError, UsageError
+    from whitefurnace.errors import UsageError
 
     if not sources:
         raise UsageError("bench tradeoff wants one environment or several: images, or the word demo")
@@ -370,13 +366,7 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
                 click.echo(f"{source}: would measure " + ", ".join(f"{m} {x:g}" for m, x in tradeoff.methods()))
         return
     if folder is not None:
-        from whitefurnace import plots
-
-        plots.require()
-        try:
-            folder.mkdir(parents=True, exist_ok=True)  # before the work, not after it
-        except OSError as error:
-            raise FileError(f"{folder}: cannot be made: {error.strerror}") from None
+        _plots_into(folder)
     on = choose_device(device)
     points: list[tradeoff.Point] = []
     costs: list[tradeoff.Cost | tradeoff.Missed] = []
@@ -406,6 +396,8 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
     else:
         _json({"event": "device", "device": said})
     if folder is not None:
+        from whitefurnace import plots
+
         path = plots.draw_tradeoff(folder, points, measured, on)
         if as_json:
             _json({"event": "plot", "file": str(path)})
@@ -454,6 +446,18 @@ def models(name: str | None, as_json: bool) -> None:
     else:
         click.echo(report.models_text(entries) if name is None else
                    "\n\n".join(report.model_text(entry) for entry in entries))
+
+
+def _plots_into(folder: Path) -> None:
+    """Makes the folder for plots, and finds matplotlib missing, before the work and not after it."""
+    from whitefurnace import plots
+    from whitefurnace.errors import FileError
+
+    plots.require()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{folder}: cannot be made: {error.strerror}") from None
 
 
 def _json(row: dict[str, Any]) -> None:

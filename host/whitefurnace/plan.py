@@ -38,6 +38,7 @@ watchdog."""
 SYMMETRIC = 8
 """How many times as many pairs the symmetric sums take in the same time."""
 
+
 def splits_for(groups: int, classes: int) -> int:
     """Into how many partial sums a launch of `groups` work items divides its classes, so that all cores are busy."""
     return max(1, min(-(-SPREAD // groups), classes // 64))

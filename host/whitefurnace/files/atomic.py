@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
 
@@ -78,6 +78,17 @@ def write_atomic(path: str | os.PathLike[str], writer: Callable[[Path], object],
     with Transaction() as transaction:
         transaction.stage(Path(path), writer)
         transaction.commit()
+
+
+def write_pieces(path: str | os.PathLike[str], pieces: Iterable[bytes | memoryview],
+                 into: Transaction | None = None) -> None:
+    """`write_atomic` of bytes, piece by piece."""
+
+    def write(temporary: Path) -> None:
+        with open(temporary, "wb") as file:
+            file.writelines(pieces)
+
+    write_atomic(path, write, into)
 
 
 def digest_file(path: str | os.PathLike[str]) -> str:

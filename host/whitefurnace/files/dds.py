@@ -8,7 +8,7 @@ import struct
 from collections.abc import Iterator
 
 from whitefurnace.errors import UnsupportedError
-from whitefurnace.files.atomic import Transaction, write_atomic
+from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import Buffer, Source, load
 from whitefurnace.files.packing import FORMATS
 from whitefurnace.files.texture import Texture, check_header, level_bytes
@@ -31,13 +31,7 @@ def write_dds(path: str | os.PathLike[str], texture: Texture, *, into: Transacti
     """Write `texture` with the DX10 header; the same texture gives the same bytes. DDS has no key-values, they are left
     out, and an array of one layer is none. Raises `UnsupportedError` for a format that DDS is not written in,
     `FileError` for what cannot be written."""
-    pieces = _pieces(texture)
-
-    def write(temporary: os.PathLike[str]) -> None:
-        with open(temporary, "wb") as file:
-            file.writelines(pieces)
-
-    write_atomic(path, write, into)
+    write_pieces(path, _pieces(texture), into)
 
 
 def dds_bytes(texture: Texture) -> bytes:

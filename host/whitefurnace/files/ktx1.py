@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from whitefurnace.errors import UnsupportedError
-from whitefurnace.files.atomic import Transaction, write_atomic
+from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import Buffer, Source, load, pack_key_values, parse_key_values
 from whitefurnace.files.packing import FORMATS
 from whitefurnace.files.texture import Texture, check_header, text_value
@@ -53,13 +53,7 @@ _ORIENTATION = "KTXorientation"
 def write_ktx1(path: str | os.PathLike[str], texture: Texture, *, into: Transaction | None = None) -> None:
     """Write `texture`; the same texture gives the same bytes. Raises `UnsupportedError` for a format that KTX 1 is not
     written in, `FileError` for what cannot be written."""
-    pieces = _pieces(texture)
-
-    def write(temporary: os.PathLike[str]) -> None:
-        with open(temporary, "wb") as file:
-            file.writelines(pieces)
-
-    write_atomic(path, write, into)
+    write_pieces(path, _pieces(texture), into)
 
 
 def ktx1_bytes(texture: Texture) -> bytes:

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from whitefurnace.errors import UnsupportedError
-from whitefurnace.files.atomic import Transaction, write_atomic
+from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import Buffer, Source, load, pack_key_values, parse_key_values
 from whitefurnace.files.packing import FORMATS
 from whitefurnace.files.texture import Texture, check_header, text_value
@@ -73,13 +73,7 @@ def write_ktx2(path: str | os.PathLike[str], texture: Texture, *, zstd: int | No
     """Write `texture`, its levels packed by Zstandard at level `zstd` (1 to 22) where given; the same texture gives the
     same bytes. The key KTXwriter is `whitefurnace` where `key_values` have none. Raises `UnsupportedError` for a format
     that KTX 2 is not written in, `FileError` for what cannot be written."""
-    pieces = _pieces(texture, zstd)
-
-    def write(temporary: os.PathLike[str]) -> None:
-        with open(temporary, "wb") as file:
-            file.writelines(pieces)
-
-    write_atomic(path, write, into)
+    write_pieces(path, _pieces(texture, zstd), into)
 
 
 def ktx2_bytes(texture: Texture, *, zstd: int | None = None) -> bytes:
