@@ -3,7 +3,7 @@ of quadrature nodes that the kernels read. Float64 throughout; `kernels/sphere.c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, lru_cache
 from typing import Any
 
@@ -32,9 +32,12 @@ class Shape:
     latlong: bool
     size: int  # face edge, or height of the lat-long
     nodes: bool = False
+    octahedral: bool = field(default=False, repr=False)  # one square of an octahedral map (octamap.py)
 
     @property
     def dims(self) -> tuple[int, ...]:
+        if self.octahedral:
+            return self.size, self.size
         return (self.size, 2 * self.size) if self.latlong else (6, self.size, self.size)
 
     @property
@@ -48,12 +51,16 @@ class Shape:
     def directions(self, index: np.ndarray | None = None) -> np.ndarray:
         """(3, m) unit directions of texel centres, of all texels or of those with the flat indices given."""
         index = np.arange(self.count) if index is None else index
+        if self.octahedral:
+            return to_direction(*((2 * x + 1) / self.size - 1 for x in (index % self.size, index // self.size)))
         if self.latlong:
             return latlong_centres(self.size, 2 * self.size, index)
         return cube_centres(self.size, index)
 
     def solid_angles(self, index: np.ndarray | None = None) -> np.ndarray:
-        """(m,) solid angles, of all texels or of those given."""
+        """(m,) solid angles, of all texels or of those given; of an octahedral map's to second order."""
+        if self.octahedral:
+            return (2 / self.size) ** 2 * octahedral_density(self.directions(index))
         if self.latlong:
             omega = latlong_solid_angles(self.size, 2 * self.size)
             return np.repeat(omega, 2 * self.size) if index is None else omega[index // (2 * self.size)]
@@ -62,6 +69,8 @@ class Shape:
 
     def mean(self, texels: np.ndarray) -> float:
         """Mean of (dims, 3) texels over the sphere, all channels together."""
+        if self.octahedral:
+            return float(np.average(texels.reshape(-1, 3).mean(1, dtype=np.float64), weights=self.solid_angles()))
         if self.latlong:
             weights = latlong_solid_angles(self.size, 2 * self.size)
             return float(weights @ texels.sum((1, 2), dtype=np.float64)) / (12 * math.pi)
@@ -90,6 +99,103 @@ def latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
     theta = (index // columns + 0.5) * math.pi / rows
     phi = (index % columns + 0.5) * 2 * math.pi / columns - math.pi
     return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)])
+
+
+def turned_cube(texels: np.ndarray, matrix: Any) -> np.ndarray:
+    """A cube (6, s, s, …) as it is stored where the world's direction d is read at `matrix` @ d, a signed permutation
+    (3, 3): whole texels change places, none is resampled."""
+    world = np.asarray(matrix).T
+    if (world == np.eye(3)).all():
+        return texels
+    faces = []
+    for face in range(6):
+        axis, right, down = (world @ part[:, face] for part in (AXIS, RIGHT, DOWN))
+        there = int(np.argmax(axis @ AXIS))
+        image = texels[there]
+        if abs(right @ DOWN[:, there]) > 0.5:  # its columns are the other's rows
+            image = image.swapaxes(0, 1)
+            columns, rows = right @ DOWN[:, there], down @ RIGHT[:, there]
+        else:
+            columns, rows = right @ RIGHT[:, there], down @ DOWN[:, there]
+        faces.append(image[::int(rows), ::int(columns)])
+    return np.ascontiguousarray(np.stack(faces))
+
+
+def to_square(d: np.ndarray) -> np.ndarray:
+    """(2, m) u, v in [-1, 1] of directions (3, m), of any length, on the square of an octahedral map: d over |x| + |y|
+    + |z| lies on an octahedron, whose lower half is folded out [Praun2003]."""
+    x, y, z = d / np.abs(d).sum(0)
+    folded = y < 0
+    u = np.where(folded, (1 - np.abs(z)) * _sign(x), x)
+    v = np.where(folded, (1 - np.abs(x)) * _sign(z), z)
+    return np.stack([u, v])
+
+
+def to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """(3, m) unit directions of u, v in [-1, 1]."""
+    y = 1 - np.abs(u) - np.abs(v)
+    folded = y < 0
+    x = np.where(folded, (1 - np.abs(v)) * _sign(u), u)
+    z = np.where(folded, (1 - np.abs(u)) * _sign(v), v)
+    d = np.stack([x, y, z])
+    return d / np.sqrt((d * d).sum(0))
+
+
+def octahedral_density(d: np.ndarray) -> np.ndarray:
+    """dω/du dv at directions (3, m): 1/|p|³, p = d/(|x| + |y| + |z|) on the octahedron, whose faces stand at 1/√3 to
+    the square and to the centre alike."""
+    return np.abs(d).sum(0) ** 3
+
+
+def _sign(x: np.ndarray) -> np.ndarray:
+    """1 at 0, either of them: an edge of the fold belongs to both of its sides."""
+    return np.where(x < 0, -1.0, 1.0)
+
+
+def face_coordinates(d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Face and its coordinates (s, t) in [-1, 1] of directions (3, m): the inverse of sphere.cube_directions."""
+    axis = np.abs(d).argmax(0)
+    face = 2 * axis + (np.take_along_axis(d, axis[None], 0)[0] < 0)
+    along = (AXIS[:, face] * d).sum(0)
+    return face, (RIGHT[:, face] * d).sum(0) / along, (DOWN[:, face] * d).sum(0) / along
+
+
+def radiance_at(env: Environment, d: np.ndarray) -> np.ndarray:
+    """(m, 3) float64: the texel of the environment in directions (3, m), its rotation included."""
+    c, s = math.cos(env.rotation), math.sin(env.rotation)
+    x, y, z = c * d[0] + s * d[2], d[1], c * d[2] - s * d[0]
+    rows, columns = env.texels.shape[-3:-1]
+    if env.kind == "latlong":
+        row = np.arccos(np.clip(y, -1, 1)) / math.pi * rows
+        column = (np.arctan2(z, x) / (2 * math.pi) + 0.5) * columns
+        at = np.minimum(row.astype(int), rows - 1) * columns + np.minimum(column.astype(int), columns - 1)
+    else:
+        face, a, b = face_coordinates(np.stack([x, y, z]))
+        column, row = (np.clip(((u + 1) / 2 * rows).astype(int), 0, rows - 1) for u in (a, b))
+        at = (face * rows + row) * rows + column
+    return env.texels.reshape(-1, 3)[at].astype(np.float64)
+
+
+POINTS = ((610, 377), (10946, 6765))
+"""Points of a texel and of its reference: Fibonacci lattices, whose error where an edge of light crosses the texel
+falls as N^-¾ however it lies."""
+
+
+def octahedral_means(env: Environment, shape: Shape, index: np.ndarray, lattice: tuple[int, int]) -> np.ndarray:
+    """(m, 3) float64: mean radiance over texels of an octahedral map, by flat index, from a lattice in each."""
+    count, step = lattice
+    a, b = ((2 * np.arange(count) + 1) / count - 1, 2 * ((np.arange(count) * step % count + 0.5) / count) - 1)
+    out = np.empty((len(index), 3))
+    step = max(1, (1 << 20) // count)
+    for first in range(0, len(index), step):
+        part = index[first:first + step]
+        u = ((2 * (part % shape.size) + 1)[:, None] + a) / shape.size - 1
+        v = ((2 * (part // shape.size) + 1)[:, None] + b) / shape.size - 1
+        d = to_direction(u.ravel(), v.ravel())
+        weight = octahedral_density(d).reshape(u.shape)
+        lit = radiance_at(env, d).reshape(*u.shape, 3)
+        out[first:first + step] = np.einsum("mk,mkc->mc", weight, lit) / weight.sum(1)[:, None]
+    return out
 
 
 def source_directions(env: Environment, index: np.ndarray) -> np.ndarray:

@@ -1,31 +1,76 @@
 """Everything that is read from or written to a file. The only importer of OpenImageIO, which is loaded when
 first needed: it takes longer to load than `--help` may."""
 
+from whitefurnace.files.arrays import is_arrays, read_header, read_npy, read_npz
 from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
 from whitefurnace.files.containers import is_texture, read_texture, write_texture
+from whitefurnace.files.env import EnvMap, read_env, write_env
 from whitefurnace.files.exr import write_exr
+from whitefurnace.files.gltf_lights import GltfLight, read_gltf_lights, write_gltf_lights
+from whitefurnace.files.harmonics import read_sh
+from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
 from whitefurnace.files.image import Image, decode_srgb, read_image
+from whitefurnace.files.lights import Light, is_light, light_digest, read_light, read_radiance
 from whitefurnace.files.manifest import read_manifest, write_manifest
 from whitefurnace.files.npy import release, scratch, write_npy
 from whitefurnace.files.npz import write_npz
-from whitefurnace.files.texture import Texture
+from whitefurnace.files.packing import pack, unpack
+from whitefurnace.files.png import write_png
+from whitefurnace.files.stored import ImageFacts, image_facts, read_rgbd, read_stored
+from whitefurnace.files.tables import Stored, check_table, identifier, number, stored_format, write_table, write_text
+from whitefurnace.files.texture import Texture, encode, text_value
 
 __all__ = [
+    "EnvMap",
+    "GltfLight",
     "Image",
+    "ImageFacts",
+    "Light",
+    "Stored",
     "Texture",
     "Transaction",
+    "check_table",
     "decode_srgb",
     "digest_file",
+    "encode",
+    "identifier",
+    "image_facts",
+    "is_arrays",
+    "is_light",
     "is_texture",
+    "light_digest",
+    "number",
+    "pack",
+    "pack_hdr",
+    "read_env",
+    "read_gltf_lights",
+    "read_header",
     "read_image",
+    "read_light",
     "read_manifest",
+    "read_npy",
+    "read_npz",
+    "read_radiance",
+    "read_rgbd",
+    "read_sh",
+    "read_stored",
     "read_texture",
     "release",
     "scratch",
+    "stored_format",
+    "text_value",
+    "unpack",
+    "unpack_hdr",
     "write_atomic",
+    "write_env",
     "write_exr",
+    "write_gltf_lights",
+    "write_hdr",
     "write_manifest",
     "write_npy",
     "write_npz",
+    "write_png",
+    "write_table",
+    "write_text",
     "write_texture",
 ]

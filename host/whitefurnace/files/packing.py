@@ -48,7 +48,7 @@ FORMATS: Mapping[str, Format] = {
         # GL 4.6 core, 2.3.4.3 and 2.3.4.4: (1 + 63/64)·2^15; blue, of 10 bits, ends at (1 + 31/32)·2^15 = 64512
         Format("b10g11r11", "unsigned floats of 11, 11 and 10 bits", 3, 4, 65024.0),
         Format("rgbd", "8-bit colour · D with D in alpha, of Babylon.js", 3, 4, 255.0),
-        # Blocks are not texels of their own: BC6H is coded in bc6h.py, ASTC is passed through as it is.
+        # Blocks are not texels of their own: BC6H is coded in bc6h.py, ASTC in astc.py.
         Format("bc6hu", "BC6H blocks, unsigned", 3, 16, 65504.0, block=4),
         Format("bc6hs", "BC6H blocks, signed", 3, 16, 65504.0, signed=True, block=4),
         Format("astc4x4hdr", "ASTC blocks of 4 x 4 texels, HDR", 4, 16, 65504.0, signed=True, block=4),

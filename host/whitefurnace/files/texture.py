@@ -14,6 +14,7 @@ from whitefurnace.files.packing import FORMATS, Packed, format_named, pack, unpa
 MAX_SIDE = 65536
 MAX_LAYERS = 2048  # of Direct3D 11 and, at least, of Vulkan
 BC6H = ("bc6hu", "bc6hs")
+ASTC = "astc4x4hdr"
 
 
 @dataclass(frozen=True)
@@ -56,14 +57,26 @@ class Texture:
 
     def decode(self, k: int) -> npt.NDArray[np.float32]:
         """Level k as a GPU reads it: float32 ([layers,] [6,] height, width, channels). Raises `UnsupportedError` for
-        ASTC, whose blocks are passed through."""
+        ASTC without astc-encoder-py."""
         width, height = self.extent(k)
         shape = (*([self.layers] if self.layers else []), *([6] if self.cube else []), height, width)
         if self.format in BC6H:
             from whitefurnace.files.bc6h import decode_bc6h  # which makes textures
 
             return decode_bc6h(self.format, memoryview(self.levels[k]), shape)
+        if self.format == ASTC:
+            from whitefurnace.files.astc import decode_astc  # loaded when needed
+
+            return decode_astc(memoryview(self.levels[k]), shape)
         return unpack(self.format, memoryview(self.levels[k]), shape)
+
+
+def upright(texels: npt.NDArray[np.float32], orientation: str) -> npt.NDArray[np.float32]:
+    """Texels (..., height, width, channels) of a texture of that orientation with their rows from the top and each row
+    from the left."""
+    if "u" in orientation:
+        texels = texels[..., ::-1, :, :]
+    return texels[..., ::-1, :] if "l" in orientation else texels
 
 
 @dataclass(frozen=True)
@@ -84,8 +97,8 @@ def encode(
     orientation: str = "rd",
 ) -> Encoded:
     """A texture of the format `form` from `levels` of floats, each ([layers,] [6,] height, width, channels); the 6 are
-    there exactly where `cube` is true. Raises `InputError` for NaN, `UnsupportedError` for signed BC6H and ASTC, which
-    are not encoded, and for `bc6hu` without ispc-texcomp."""
+    there exactly where `cube` is true. Raises `InputError` for NaN, `UnsupportedError` for signed BC6H, which is not
+    encoded, for `bc6hu` without ispc-texcomp and for `astc4x4hdr` without astc-encoder-py."""
     arrays = [np.asarray(level) for level in levels]
     if not arrays:
         raise ValueError("a texture has at least one level")
@@ -112,6 +125,10 @@ def _pack(form: str, array: npt.NDArray[np.generic]) -> Packed:
         from whitefurnace.files.bc6h import encode_bc6h  # which makes textures
 
         return encode_bc6h(array)
+    if form == ASTC:
+        from whitefurnace.files.astc import encode_astc
+
+        return encode_astc(array)
     return pack(form, array)
 
 

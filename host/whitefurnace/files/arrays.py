@@ -1,0 +1,129 @@
+"""Reads .npy and .npz files that anyone may have written: what their headers say allocates nothing until the file is
+known to hold it, and nothing in them is executed."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import InputError
+from whitefurnace.files.binary import MAX_BYTES, Source, load
+
+NPY, ZIP = b"\x93NUMPY", b"PK\x03\x04"
+_ARRAY = re.compile(r"static const (?:float|double) \w+((?:\[\d{1,9}\]){1,8}) = \{")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_DENSEST = 1032
+"""Bytes that a byte of deflated data can become at most [zlib: Maximum Expansion Factor]."""
+_READERS: dict[tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.dtype[Any]]]] = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+# What numpy's parser of the header and zipfile raise for bytes that make no sense.
+_NONSENSE = (ValueError, TypeError, SyntaxError, OverflowError, EOFError, MemoryError, RecursionError, LookupError,
+             AttributeError, NotImplementedError, RuntimeError, tokenize.TokenError, struct.error, zlib.error,
+             zipfile.BadZipFile, OSError)
+
+
+def read_npy(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
+    """The array of numbers in a .npy file. Raises `FileError`, and `InputError` for what is not valid or holds anything
+    but numbers."""
+    import io
+
+    source = load(path)
+    return _array(cast(BinaryIO, io.BytesIO(source.view)), len(source), source, "it")
+
+
+def read_npz(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of a .npz file by name, in its order; every checksum is compared. Raises as `read_npy`."""
+    import io
+
+    source = load(path)
+    found: dict[str, npt.NDArray[Any]] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(source.view)) as archive:
+            members = archive.infolist()
+            if sum(member.file_size for member in members) > min(MAX_BYTES, _DENSEST * len(source)):
+                raise source.wrong("its directory says that it holds more than its bytes can")
+            for member in members:
+                name = member.filename.removesuffix(".npy")
+                if name in found:
+                    raise source.wrong(f"it holds {name!r} twice")
+                with archive.open(member) as stream:
+                    found[name] = _array(cast(BinaryIO, stream), member.file_size, source, f"its member {name!r}")
+                    if stream.read(1):
+                        raise source.wrong(f"its member {name!r} is longer than its header says")
+    except InputError:
+        raise
+    except _NONSENSE as error:
+        raise source.wrong(f"it is truncated or corrupted ({_said(error)})") from error
+    return found
+
+
+def read_header(path: str | os.PathLike[str]) -> npt.NDArray[np.float64] | None:
+    """The array of floats in a C header, of the sizes that it states; None for one without such an array. Raises as
+    `read_npy`."""
+    source = load(path)
+    try:
+        text = bytes(source.view).decode()
+    except UnicodeDecodeError:
+        raise source.wrong("it is no text in UTF-8") from None
+    found = _ARRAY.search(text)
+    if found is None:
+        if "#define" in text:
+            return None
+        raise source.wrong("it is no C header: it has neither an array of floats nor a macro")
+    shape = tuple(int(size) for size in found[1].strip("[]").split("]["))
+    body, end, _ = text[found.end():].partition("};")
+    numbers = _NUMBER.findall(body)
+    if not end or math.prod(shape) != len(numbers):
+        raise source.wrong(f"it says that it has {math.prod(shape)} numbers, {len(numbers)} are there")
+    return np.array([float(number) for number in numbers]).reshape(shape)
+
+
+def is_arrays(path: str | os.PathLike[str]) -> bool:
+    """Whether a file begins as .npy does, or as .npz does and is named so."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(6)
+    except (OSError, ValueError):
+        return False
+    return head == NPY or (head.startswith(ZIP) and Path(path).suffix.lower() == ".npz")
+
+
+def _array(stream: BinaryIO, size: int, source: Source, what: str) -> npt.NDArray[Any]:
+    """The array of a stream of `size` bytes."""
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version not in _READERS:
+            raise source.wrong(f"{what} is of version {version[0]}.{version[1]} of .npy, 1.0 and 2.0 are read")
+        shape, fortran, dtype = _READERS[version](stream)
+        start = stream.tell()
+    except InputError:
+        raise
+    except _NONSENSE as error:
+        raise source.wrong(f"{what} has no header of .npy ({_said(error)})") from error
+    if dtype.kind not in "fiub" or any(not isinstance(n, int) or n < 0 for n in shape):
+        raise source.wrong(f"{what} holds {dtype}, not numbers")
+    wanted = math.prod(shape) * dtype.itemsize
+    if wanted != size - start:
+        raise source.wrong(f"{what} says that it has {wanted} bytes of numbers, {size - start} are there")
+    try:
+        flat = np.frombuffer(stream.read(wanted), dtype)
+        return flat.reshape(shape, order="F" if fortran else "C")
+    except _NONSENSE as error:
+        raise source.wrong(f"{what} is truncated or corrupted ({_said(error)})") from error
+
+
+def _said(error: BaseException) -> str:
+    return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__

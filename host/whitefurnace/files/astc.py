@@ -1,0 +1,75 @@
+"""ASTC blocks of 4 x 4 HDR texels, coded and decoded by the optional package `astc-encoder-py`, Arm's own codec."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import InputError, UnsupportedError
+from whitefurnace.files.packing import FORMATS, Packed, pack
+
+SIDE = 4
+QUALITY = 98.0
+"""astcenc's preset `-thorough`."""
+
+
+def encode_astc(values: npt.ArrayLike, *, quality: float = QUALITY) -> Packed:
+    """`values` (..., height, width, 3 | 4) as HDR blocks, a fourth channel too: uint8 (..., blocks down, blocks across,
+    16). `quality` is astcenc's, 0 to 100. Values too large for a half become 65504 and negative ones, which HDR blocks
+    do not have, 0, and both are counted. Raises `InputError` for NaN, `UnsupportedError` where astc-encoder-py is not
+    installed."""
+    if not 0 <= quality <= 100:
+        raise UnsupportedError(f"a quality of {quality:g} of ASTC is not between 0 and 100")
+    astc = _library()
+    array = np.asarray(values)
+    if array.ndim < 3 or array.shape[-1] not in (3, 4):
+        raise ValueError(f"values of shape {array.shape} are not (..., height, width, 3 | 4)")
+    negative = int(np.count_nonzero(array < 0))
+    halves = pack("rgba16f", np.maximum(array, 0))  # NaN stays NaN and is refused
+    height, width = array.shape[-3:-1]
+    context = _context(astc, quality, 0)
+    swizzle = astc.ASTCSwizzle.from_str("rgba" if array.shape[-1] == 4 else "rgb1")
+    blocks = [
+        context.compress(astc.ASTCImage(astc.ASTCType.F16, width, height, 1, image.tobytes()), swizzle)
+        for image in halves.data.reshape(-1, height, width, 8)
+    ]
+    shape = (*array.shape[:-3], -(-height // SIDE), -(-width // SIDE), FORMATS["astc4x4hdr"].size)
+    return Packed(np.frombuffer(b"".join(blocks), np.uint8).reshape(shape), halves.clipped, negative)
+
+
+def decode_astc(data: bytes | memoryview, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
+    """The blocks `data` as float32 (*shape, 4), `shape` (..., height, width) in texels; blocks that are not valid are
+    NaN, as on a GPU. Raises `UnsupportedError` where astc-encoder-py is not installed."""
+    astc = _library()
+    height, width = shape[-2:]
+    size = -(-height // SIDE) * -(-width // SIDE) * FORMATS["astc4x4hdr"].size
+    blocks = memoryview(data).cast("B")
+    if not len(blocks) or len(blocks) % size:
+        raise ValueError(f"{len(blocks)} bytes are not {shape} texels of astc4x4hdr")
+    context = _context(astc, 0, astc.ASTCConfigFlags.DECOMPRESS_ONLY)
+    swizzle = astc.ASTCSwizzle.from_str("rgba")
+    out = np.empty((len(blocks) // size, height, width, 4), np.float32)
+    for k in range(len(out)):
+        image = astc.ASTCImage(astc.ASTCType.F16, width, height)
+        try:
+            context.decompress(bytes(blocks[k * size : (k + 1) * size]), image, swizzle)
+        except astc.ASTCError as error:
+            raise InputError(f"astcenc cannot decode {size} bytes of ASTC: {str(error).splitlines()[0]}") from error
+        out[k] = np.frombuffer(image.data, "<f2").reshape(height, width, 4)
+    return out.reshape(*shape, 4)
+
+
+def _context(astc: Any, quality: float, flags: int) -> Any:
+    config = astc.ASTCConfig(astc.ASTCProfile.HDR, SIDE, SIDE, 1, quality, flags)
+    return astc.ASTCContext(config)
+
+
+def _library() -> Any:
+    try:
+        import astc_encoder
+    except ImportError as error:
+        raise UnsupportedError("ASTC is encoded and decoded by astc-encoder-py, which is not installed: "
+                               "pip install 'whitefurnace[astc]'") from error
+    return astc_encoder

@@ -1,0 +1,173 @@
+"""Babylon.js `.env` environments, as @babylonjs/core 9 (Misc/environmentTextureTools) writes and reads them: a magic
+number, a JSON manifest with a NUL at its end, and images of RGBD cube faces, mip by mip."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.files.atomic import Transaction, write_pieces
+from whitefurnace.files.binary import Source, load
+from whitefurnace.files.jsontext import Reader, parse_object
+from whitefurnace.files.rgbd import MAX_SIZE, Level, check_chain, decode_face, encode_faces
+
+MAGIC = bytes((0x86, 0x16, 0x87, 0x96, 0xF6, 0xD6, 0x96, 0x36))
+VERSION = 2
+POLYNOMIALS = ("x", "y", "z", "xx", "yy", "zz", "yz", "zx", "xy")
+LOD_SCALE = 0.8
+_MAX_MANIFEST = 1 << 20
+_IMAGE_TYPES = ("image/png", "image/webp")
+
+
+@dataclass(frozen=True, eq=False)
+class EnvMap:
+    """What an `.env` holds. `levels[k]` is float32 (6, n >> k, n >> k, 3), GL-direct (the texel for direction d is what
+    `textureCube(d)` returns in the engine), all of them down to one texel; r is read at `lod_scale`·log2(n·r²).
+
+    `polynomials` (9, 3) are the rows x y z xx yy zz yz zx xy of P(n) = x·n.x + … + xx·n.x² + …, or None, and then the
+    engine makes its own of the levels. Materials with `brdf.useSphericalHarmonics` false show P(n) as E/π. By default
+    it is true, and they show P with its part of l = 1 times 3/2 and that of l = 2 times 4 (`preScaledHarmonics` leaves
+    out the cosine's 2/3 and 1/4), which the engine's own files have divided out before.
+
+    `irradiance` (6, m, m, 3) is E/π as a cube, used instead of P by materials that can; `dominant` beside it is the
+    direction of the strongest light, or None."""
+
+    levels: tuple[Level, ...]
+    polynomials: npt.NDArray[np.float64] | None = None
+    irradiance: Level | None = None
+    lod_scale: float = LOD_SCALE
+    dominant: tuple[float, float, float] | None = None
+    version: int = VERSION
+    image_type: str = "image/png"
+
+    def __post_init__(self) -> None:
+        if complaint := check_chain(self.levels, whole=True):
+            raise ValueError(f"an .env map is wrong: {complaint}")
+        if self.polynomials is not None and np.shape(self.polynomials) != (len(POLYNOMIALS), 3):
+            raise ValueError(f"polynomials of shape {np.shape(self.polynomials)} are not (9, 3)")
+        if self.irradiance is not None:
+            if complaint := check_chain((self.irradiance,), whole=False):
+                raise ValueError(f"the irradiance of an .env map is wrong: {complaint}")
+
+    @property
+    def size(self) -> int:
+        """Texels a side of level 0."""
+        return self.levels[0].shape[1]
+
+
+def write_env(path: str | os.PathLike[str], envmap: EnvMap, *, into: Transaction | None = None) -> tuple[int, int]:
+    """Write version 2 with PNG; the same map gives the same bytes. Returns how many values were clipped to 255, the
+    most that RGBD holds, and how many negative ones became 0. Raises `InputError` for NaN, `FileError` for what cannot
+    be written."""
+    data, clipped, negative = env_bytes(envmap)
+    write_pieces(path, [data], into)
+    return clipped, negative
+
+
+def env_bytes(envmap: EnvMap) -> tuple[bytes, int, int]:
+    """The file as bytes, and what `write_env` returns. Raises `InputError` for NaN."""
+    if envmap.irradiance is not None and envmap.polynomials is None:
+        # Babylon would write zeros, which leave every material black that does not read the cube.
+        raise ValueError("irradiance as a cube needs the polynomials beside it")
+    places: list[dict[str, int]] = []
+    blobs: list[bytes] = []
+    at = clipped = negative = 0
+    for level in (*envmap.levels, *([] if envmap.irradiance is None else [envmap.irradiance])):
+        images, over, below = encode_faces(level)
+        clipped, negative = clipped + over, negative + below
+        for image in images:
+            places.append({"length": len(image), "position": at})
+            at += len(image)
+        blobs += images
+    specular = places[: 6 * len(envmap.levels)]
+    irradiance: dict[str, Any] | None = None
+    if envmap.polynomials is not None:
+        rows = np.asarray(envmap.polynomials, np.float64).tolist()
+        irradiance = dict(zip(POLYNOMIALS, rows, strict=True))
+        if envmap.irradiance is not None:
+            irradiance["irradianceTexture"] = {"size": envmap.irradiance.shape[1], "faces": places[len(specular) :]} | (
+                {} if envmap.dominant is None else {"dominantDirection": list(envmap.dominant)})
+    manifest = {
+        "version": VERSION, "width": envmap.size, "imageType": "image/png", "irradiance": irradiance,
+        "specular": {"mipmaps": specular, "lodGenerationScale": envmap.lod_scale},
+    }
+    text = json.dumps(manifest, separators=(",", ":"), allow_nan=False)
+    return MAGIC + text.encode("ascii") + b"\0" + b"".join(blobs), clipped, negative
+
+
+def read_env(path: str | os.PathLike[str]) -> EnvMap:
+    """Read version 1 or 2, decoded as the engine decodes. Raises `FileError`, and `InputError` for what is not
+    valid."""
+    return parse_env(load(path))
+
+
+def parse_env(source: Source) -> EnvMap:
+    """The map in the bytes of a file. Raises `InputError` for what is not valid."""
+    if source.piece(0, len(MAGIC), "the magic number of an .env") != MAGIC:
+        raise source.wrong("it does not begin with the magic number of a Babylon.js .env")
+    head = bytes(source.view[len(MAGIC) : len(MAGIC) + _MAX_MANIFEST])
+    length = head.find(b"\0")
+    if length < 0:
+        raise source.wrong(f"its manifest does not end within {len(head)} bytes")
+    # Byte by byte, as the engine takes it.
+    manifest = parse_object(source, head[:length].decode("latin-1"), "its manifest")
+    start = len(MAGIC) + length + 1
+    take = Reader(source)
+    version = take.whole(manifest.get("version", 1), "its version", 1, VERSION)
+    width = take.whole(manifest.get("width"), "its width", 1, MAX_SIZE)
+    if width & (width - 1):
+        raise source.wrong(f"its width is {width}, a power of two was expected")
+    image_type = "image/png" if version == 1 else take.text(manifest.get("imageType", "image/png"), "its imageType")
+    if image_type not in _IMAGE_TYPES:
+        raise source.wrong(f"its images are {image_type[:40]!r}, {' and '.join(_IMAGE_TYPES)} are read")
+    specular = take.object(manifest.get("specular"), "specular")
+    count = width.bit_length()
+    spans = _spans(take, specular.get("mipmaps"), "specular.mipmaps", 6 * count, start)
+    scale = take.number(specular.get("lodGenerationScale") or LOD_SCALE, "lodGenerationScale")  # as `||` in JavaScript
+
+    light = take.object(manifest.get("irradiance") or {}, "irradiance")
+    polynomials = None
+    if any(name in light for name in POLYNOMIALS):
+        polynomials = take.rows([light.get(name) for name in POLYNOMIALS], "irradiance (x y z xx yy zz yz zx xy)", 9)
+    dominant = None
+    side = 0
+    if light.get("irradianceTexture"):
+        texture = take.object(light["irradianceTexture"], "irradianceTexture")
+        side = take.whole(texture.get("size"), "the size of irradianceTexture", 1, MAX_SIZE)
+        if side & (side - 1):
+            raise source.wrong(f"the size of irradianceTexture is {side}, a power of two was expected")
+        spans += _spans(take, texture.get("faces"), "irradianceTexture.faces", 6, start)
+        if texture.get("dominantDirection"):
+            x, y, z = take.rows([texture["dominantDirection"]], "dominantDirection", 1)[0].tolist()
+            dominant = x, y, z
+    for (first, bytes_there), (second, _) in zip(sorted(spans), sorted(spans)[1:], strict=False):
+        if first + bytes_there > second:  # each texel that is unpacked was in the file
+            raise source.wrong(f"its images overlap at byte {second}, each must have bytes of its own")
+
+    sides = [width >> k // 6 for k in range(6 * count)] + [side] * 6
+    faces = []
+    for k, (at, size) in enumerate(spans):
+        name = f"face {k % 6} of " + (f"mip {k // 6}" if k < 6 * count else "irradianceTexture")
+        piece = Source(source.piece(at, size, name), f"{source.name}, {name},")
+        faces.append(decode_face(piece, sides[k]))
+    cubes = [np.stack(faces[k : k + 6]) for k in range(0, len(faces), 6)]
+    return EnvMap(tuple(cubes[:count]), polynomials, cubes[count] if side else None, scale, dominant, version,
+                  image_type)
+
+
+def _spans(take: Reader, value: Any, what: str, count: int, start: int) -> list[tuple[int, int]]:
+    """Offset in the file and length of each image."""
+    most = len(take.source)
+    out = []
+    for k, entry in enumerate(take.array(value, what, count, count)):
+        place = take.object(entry, f"entry {k} of {what}")
+        length = take.whole(place.get("length"), f"the length of entry {k} of {what}", 1, most)
+        position = take.whole(place.get("position"), f"the position of entry {k} of {what}", 0, most)
+        take.source.piece(start + position, length, f"entry {k} of {what}")
+        out.append((start + position, length))
+    return out

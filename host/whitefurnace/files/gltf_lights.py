@@ -1,0 +1,269 @@
+"""glTF's EXT_lights_image_based [KhronosGroup/glTF, extensions/2.0/Vendor/EXT_lights_image_based]: a prefiltered cube
+as RGBD faces in PNG, and irradiance as nine coefficients. Written as one .gltf; .gltf and .glb of others are read.
+
+The extension wants every image "flipped about its vertical axis to correspond with the way glTF references texture
+space"; what its loader in Babylon.js undoes is rows from the bottom up, and so they are written and read here."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import FileError
+from whitefurnace.files.atomic import Transaction, write_pieces
+from whitefurnace.files.binary import MAX_BYTES, Source, load
+from whitefurnace.files.jsontext import Reader, parse_object
+from whitefurnace.files.rgbd import MAX_SIZE, Level, check_chain, decode_face, encode_faces
+
+NAME = "EXT_lights_image_based"
+GLB_MAGIC = b"glTF"
+_JSON, _BIN = 0x4E4F534A, 0x004E4942  # kinds of GLB chunks [glTF 2.0, 4.4.3]
+MAX_LIGHTS = 16
+MAX_IMAGES = 1 << 16
+_MAX_JSON = 1 << 30
+_DATA = "data:"
+
+
+@dataclass(frozen=True, eq=False)
+class GltfLight:
+    """One light. `levels[k]` is float32 (6, n >> k, n >> k, 3), GL-direct, r = k/(levels − 1); they may stop before one
+    texel (near 16), an engine reads none of the mips that follow. `coefficients` (9, 3) are of irradiance, A_l·L_lm
+    with A = π, 2π/3, π/4, in the order L00 L1−1 L10 L11 L2−2 L2−1 L20 L21 L22; Babylon.js 9 takes them with the sign
+    (−1)^m of Condon and Shortley, of which the extension says nothing. `rotation` is a quaternion x y z w."""
+
+    levels: tuple[Level, ...]
+    coefficients: npt.NDArray[np.float64]
+    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    intensity: float = 1.0
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if complaint := check_chain(self.levels, whole=False):
+            raise ValueError(f"an image-based light is wrong: {complaint}")
+        if np.shape(self.coefficients) != (9, 3):
+            raise ValueError(f"irradiance coefficients of shape {np.shape(self.coefficients)} are not (9, 3)")
+
+    @property
+    def size(self) -> int:
+        """Texels a side of level 0: `specularImageSize`."""
+        return self.levels[0].shape[1]
+
+
+def write_gltf_lights(path: str | os.PathLike[str], light: GltfLight | Sequence[GltfLight], *,
+                      into: Transaction | None = None) -> tuple[int, int]:
+    """Write a .gltf with the images in it, the scene k lit by light k; the same lights give the same bytes. Returns how
+    many values were clipped to 255, the most that RGBD holds, and how many negative ones became 0. Raises `InputError`
+    for NaN, `FileError` for what cannot be written."""
+    text, clipped, negative = gltf_text([light] if isinstance(light, GltfLight) else light)
+    write_pieces(path, [text.encode("ascii")], into)
+    return clipped, negative
+
+
+def gltf_text(lights: Sequence[GltfLight]) -> tuple[str, int, int]:
+    """The file as a text, and what `write_gltf_lights` returns. Raises `InputError` for NaN."""
+    if not 1 <= len(lights) <= MAX_LIGHTS:
+        raise ValueError(f"there are {len(lights)} lights, 1 to {MAX_LIGHTS} are written")
+    images: list[dict[str, str]] = []
+    entries = []
+    clipped = negative = 0
+    for light in lights:
+        mips = []
+        for level in light.levels:
+            faces, over, below = encode_faces(level)
+            clipped, negative = clipped + over, negative + below
+            mips.append(list(range(len(images), len(images) + 6)))
+            images += [{"uri": f"{_DATA}image/png;base64,{base64.b64encode(face).decode()}"} for face in faces]
+        entries.append({
+            **({"name": light.name} if light.name else {}),
+            "rotation": list(light.rotation),
+            "intensity": light.intensity,  # Babylon.js multiplies by it even where it is not given, and gets NaN
+            "irradianceCoefficients": np.asarray(light.coefficients, np.float64).tolist(),
+            "specularImageSize": light.size,
+            "specularImages": mips,
+        })
+    document = {
+        "asset": {"version": "2.0", "generator": "whitefurnace"},
+        "extensionsUsed": [NAME],
+        "extensions": {NAME: {"lights": entries}},
+        "scene": 0,
+        "scenes": [{"extensions": {NAME: {"light": k}}} for k in range(len(lights))],
+        "images": images,
+    }
+    return json.dumps(document, separators=(",", ":"), allow_nan=False), clipped, negative
+
+
+def read_gltf_lights(path: str | os.PathLike[str]) -> tuple[GltfLight, ...]:
+    """The lights of a .gltf or .glb, whose images and buffers may be in it or in files of its folder. Raises
+    `FileError`, and `InputError` for what is not valid, has no such light or names a file outside its folder."""
+    return parse_gltf_lights(load(path), Path(path).parent)
+
+
+def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfLight, ...]:
+    """The lights in the bytes of a file; files beside it are read from `folder`, and refused where it is None. Raises
+    `FileError` and `InputError`."""
+    document, binary = _document(source)
+    take = Reader(source)
+    extension = take.object(document.get("extensions", {}), "extensions").get(NAME)
+    if extension is None:
+        raise source.wrong(f"it is a glTF without {NAME}")
+    found = take.array(take.object(extension, NAME).get("lights"), f"{NAME}.lights", 1, MAX_LIGHTS)
+    images = _Images(take, document, binary, folder)
+    entries = [_entry(take, entry, f"light {k}") for k, entry in enumerate(found)]
+    texels = sum(6 * (size >> mip) ** 2 for _, size, mips in entries for mip in range(len(mips)))
+    if 12 * texels > MAX_BYTES:
+        raise source.wrong(f"its lights have {12 * texels} bytes of texels, at most {MAX_BYTES} are allowed")
+    lights = []
+    for k, (light, size, mips) in enumerate(entries):
+        what = f"light {k}"
+        coefficients = take.rows(light.get("irradianceCoefficients"), f"irradianceCoefficients of {what}", 9)
+        x, y, z, w = [take.number(value, f"a number of rotation of {what}")
+                      for value in take.array(light.get("rotation", [0, 0, 0, 1]), f"rotation of {what}", 4, 4)]
+        intensity = take.number(light.get("intensity", 1), f"intensity of {what}")
+        name = take.text(light.get("name", ""), f"name of {what}")
+        levels = []
+        for mip, faces in enumerate(mips):
+            six = take.array(faces, f"mip {mip} of {what}", 6, 6)
+            levels.append(np.stack([images.face(index, size >> mip, f"face {face} of mip {mip} of {what}")
+                                    for face, index in enumerate(six)]))
+        lights.append(GltfLight(tuple(levels), coefficients, (x, y, z, w), intensity, name))
+    return tuple(lights)
+
+
+def _entry(take: Reader, entry: Any, what: str) -> tuple[dict[str, Any], int, list[Any]]:
+    """A light of the file, the side of its level 0 and its mips."""
+    light = take.object(entry, what)
+    size = take.whole(light.get("specularImageSize"), f"specularImageSize of {what}", 1, MAX_SIZE)
+    if size & (size - 1):
+        raise take.source.wrong(f"specularImageSize of {what} is {size}, a power of two was expected")
+    return light, size, take.array(light.get("specularImages"), f"specularImages of {what}", 1, size.bit_length())
+
+
+def _document(source: Source) -> tuple[dict[str, Any], memoryview | None]:
+    """The JSON of a .gltf or .glb and the binary chunk of the latter."""
+    if bytes(source.view[:4]) != GLB_MAGIC:
+        if len(source) > _MAX_JSON:
+            raise source.wrong(f"it has {len(source)} bytes, JSON of glTF has at most {_MAX_JSON}")
+        return _json(source, source.view), None
+    version, total = source.integers("2I", 4, "the GLB header")
+    if version != 2:
+        raise source.wrong(f"it is a GLB of version {version}, 2 is read")
+    source.piece(0, total, "what the GLB header says")
+    document: dict[str, Any] | None = None
+    binary: memoryview | None = None
+    at = 12
+    while at < total:
+        what = f"the GLB chunk at byte {at}"
+        length, kind = source.integers("2I", at, what)
+        if at + 8 + length > total:
+            raise source.wrong(f"{what} has {length} bytes and reaches beyond the {total} of the GLB")
+        body = source.piece(at + 8, length, what)
+        if document is None:
+            if kind != _JSON or length > _MAX_JSON:
+                raise source.wrong("the first chunk of a GLB must be its JSON")
+            document = _json(source, body)
+        elif kind == _BIN and binary is None:
+            binary = body
+        at += 8 + length
+    if document is None:
+        raise source.wrong("it is a GLB without JSON")
+    return document, binary
+
+
+def _json(source: Source, data: memoryview) -> dict[str, Any]:
+    try:
+        text = bytes(data).decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise source.wrong("it is neither GLB nor a text in UTF-8") from None
+    return parse_object(source, text, "its JSON")
+
+
+class _Images:
+    """Images by index, decoded once; buffers and files are loaded once."""
+
+    def __init__(self, take: Reader, document: Mapping[str, Any], binary: memoryview | None,
+                 folder: Path | None) -> None:
+        self._take, self._source, self._binary, self._folder = take, take.source, binary, folder
+        self._images = take.array(document.get("images", []), "images", 0, MAX_IMAGES)
+        self._views = take.array(document.get("bufferViews", []), "bufferViews", 0, MAX_IMAGES)
+        self._buffers = take.array(document.get("buffers", []), "buffers", 0, MAX_IMAGES)
+        self._faces: dict[tuple[int, int], Level] = {}
+        self._loaded: dict[int, memoryview] = {}
+
+    def face(self, index: Any, side: int, what: str) -> Level:
+        """The image that `what` names, as a face of side x side."""
+        k = self._index(index, len(self._images), "image", what)
+        if (k, side) not in self._faces:
+            piece = Source(self._bytes(k), f"{self._source.name}, image {k} ({what}),")
+            self._faces[k, side] = decode_face(piece, side)
+        return self._faces[k, side]
+
+    def _index(self, value: Any, count: int, thing: str, what: str) -> int:
+        if not count:
+            raise self._source.wrong(f"{what} names an {thing}, there is none")
+        return self._take.whole(value, f"the {thing} of {what}", 0, count - 1)
+
+    def _bytes(self, k: int) -> memoryview:
+        image = self._take.object(self._images[k], f"image {k}")
+        if "uri" in image:
+            return self._uri(image["uri"], f"image {k}")
+        view_number = self._index(image.get("bufferView"), len(self._views), "bufferView", f"image {k}")
+        what = f"bufferView {view_number}"
+        view = self._take.object(self._views[view_number], what)
+        buffer = self._index(view.get("buffer"), len(self._buffers), "buffer", what)
+        data = self._buffer(buffer)
+        at = self._take.whole(view.get("byteOffset", 0), f"byteOffset of {what}", 0, len(data))
+        length = self._take.whole(view.get("byteLength"), f"byteLength of {what}", 1, len(data))
+        if at + length > len(data):
+            raise self._source.wrong(f"{what} takes bytes {at} to {at + length}, buffer {buffer} has {len(data)}")
+        return data[at : at + length]
+
+    def _buffer(self, k: int) -> memoryview:
+        if k not in self._loaded:
+            buffer = self._take.object(self._buffers[k], f"buffer {k}")
+            if "uri" in buffer:
+                data = self._uri(buffer["uri"], f"buffer {k}")
+            elif k == 0 and self._binary is not None:
+                data = self._binary
+            else:
+                raise self._source.wrong(f"buffer {k} has no uri, and the file no binary chunk for it")
+            self._loaded[k] = data
+        return self._loaded[k]
+
+    def _uri(self, value: Any, what: str) -> memoryview:
+        """What a data URI holds, or a file in the folder of the glTF."""
+        uri = self._take.text(value, f"the uri of {what}")
+        if uri[: len(_DATA)].lower() == _DATA:
+            head, comma, body = uri.partition(",")
+            if not comma or not head.lower().endswith(";base64"):
+                raise self._source.wrong(f"the data URI of {what} is not in base64")
+            try:
+                return memoryview(base64.b64decode(body, validate=True))
+            except (binascii.Error, ValueError):
+                raise self._source.wrong(f"the data URI of {what} is not valid base64") from None
+        return load(self._file(unquote(uri), what)).view
+
+    def _file(self, name: str, what: str) -> Path:
+        """A path in the folder. Neither a scheme nor an absolute path, not upwards and not through a link that leads
+        out: a glTF from anywhere must not tell what else is on the disk."""
+        shown = name[:60].encode("ascii", "backslashreplace").decode()
+        outside = self._source.wrong(f"the uri of {what}, {shown!r}, is not a file in the folder of the glTF")
+        if self._folder is None or not name or not name.isprintable() or name[0] in "/\\" or set(name) & set(":\\"):
+            raise outside
+        try:
+            folder = self._folder.resolve(strict=True)
+            path = (folder / name).resolve()
+        except (OSError, ValueError, RuntimeError) as error:
+            raise FileError(f"cannot read {shown!r}, which {what} of {self._source.name} names: {error}") from error
+        if not path.is_relative_to(folder):
+            raise outside
+        return path

@@ -1,0 +1,38 @@
+"""Nine RGB coefficients as the small texts that engines and tools pass around: a line for each, `( r, g, b); // name`,
+or JSON by name."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.files.binary import load
+
+_MAX_BYTES = 1 << 16
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+
+
+def read_sh(path: str | os.PathLike[str]) -> npt.NDArray[np.float64]:
+    """The (9, 3) numbers of a .txt or .json, in the order in which they stand. Raises `FileError`, and `InputError` for
+    what is not nine lines, or nine names, of three finite numbers."""
+    source = load(path)
+    if len(source) > _MAX_BYTES:
+        raise source.wrong(f"it has {len(source)} bytes, nine rows of numbers have fewer than {_MAX_BYTES}")
+    rows: list[list[float]]
+    try:
+        text = bytes(source.view).decode()
+        if text.lstrip().startswith("{"):
+            rows = [[float(x) for x in row] for row in json.loads(text).values()]
+        else:
+            lines = (line.partition("//")[0] for line in text.splitlines())
+            rows = [[float(x) for x in _NUMBER.findall(line)] for line in lines if line.strip()]
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        raise source.wrong("it is no text of numbers") from None
+    if len(rows) != 9 or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in rows):
+        raise source.wrong("it does not hold nine rows of three finite numbers")
+    return np.array(rows)

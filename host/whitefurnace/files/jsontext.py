@@ -1,0 +1,79 @@
+"""JSON that others wrote, as far as it can be trusted: each value is taken with its kind and range or refused in one
+sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.files.binary import Source
+
+
+def parse_object(source: Source, text: str, what: str) -> dict[str, Any]:
+    """The JSON object in `text`. Raises `InputError`."""
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:  # a number of too many digits is a ValueError too
+        reason = str(error).splitlines()[0][:120] if isinstance(error, ValueError) else "nested too deep"
+        raise source.wrong(f"{what} is not JSON ({reason})") from error
+    if not isinstance(found, dict):
+        raise source.wrong(f"{what} is not a JSON object")
+    return found
+
+
+class Reader:
+    """Typed access to values of an object of JSON in `source`. All raise `InputError`."""
+
+    def __init__(self, source: Source) -> None:
+        self.source = source
+
+    def object(self, value: Any, what: str) -> dict[str, Any]:
+        if not isinstance(value, dict):
+            raise self.source.wrong(f"{what} is {_kind(value)}, an object was expected")
+        return value
+
+    def array(self, value: Any, what: str, least: int, most: int) -> list[Any]:
+        if not isinstance(value, list):
+            raise self.source.wrong(f"{what} is {_kind(value)}, an array was expected")
+        if not least <= len(value) <= most:
+            many = str(least) if least == most else f"{least} to {most}"
+            raise self.source.wrong(f"{what} has {len(value)} entries, {many} are allowed")
+        return value
+
+    def whole(self, value: Any, what: str, least: int, most: int) -> int:
+        """A whole number, which JSON may write as 2.0."""
+        if isinstance(value, bool) or not isinstance(value, int | float) or value != value // 1:
+            raise self.source.wrong(f"{what} is {_kind(value)}, a whole number was expected")
+        if not least <= value <= most:
+            raise self.source.wrong(f"{what} is {value!r:.40}, {least} to {most} is allowed")
+        return int(value)
+
+    def number(self, value: Any, what: str) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e300:
+            raise self.source.wrong(f"{what} is {_kind(value)}, a finite number was expected")
+        return float(value)
+
+    def text(self, value: Any, what: str) -> str:
+        if not isinstance(value, str):
+            raise self.source.wrong(f"{what} is {_kind(value)}, a text was expected")
+        return value
+
+    def rows(self, value: Any, what: str, count: int) -> npt.NDArray[np.float64]:
+        """(count, 3) finite numbers."""
+        rows = self.array(value, what, count, count)
+        threes = [self.array(row, f"entry {k} of {what}", 3, 3) for k, row in enumerate(rows)]
+        return np.array([[self.number(number, f"a number of {what}") for number in row] for row in threes], np.float64)
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "missing"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int | float):
+        return "not finite" if isinstance(value, float) and not math.isfinite(value) else f"{value!r:.40}"
+    return "a text" if isinstance(value, str) else "an array" if isinstance(value, list) else "an object"

@@ -1,0 +1,95 @@
+"""An image as its file has it: facts of the header, and values without the decoding that makes radiance of them."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import FileError, InputError
+from whitefurnace.files import image
+from whitefurnace.files.binary import load
+from whitefurnace.files.integrity import check_file
+from whitefurnace.files.packing import unpack
+from whitefurnace.files.png import decode_png
+
+PREFIX = "whitefurnace:"
+
+
+@dataclass(frozen=True)
+class ImageFacts:
+    """What the header of an image says: `format` OpenImageIO's name, `pixel` the type of a value ("half", "uint8"),
+    `compression` where there is one, `attributes` our own, without their prefix."""
+
+    format: str
+    width: int
+    height: int
+    channels: tuple[str, ...]
+    pixel: str
+    compression: str = ""
+    attributes: Mapping[str, str | float | int] = field(default_factory=dict)
+
+
+def image_facts(path: str | os.PathLike[str]) -> ImageFacts:
+    """The facts of an image file. Raises `FileError`, and `InputError` for what is no valid image."""
+    with _opened(Path(path)) as (_, facts):
+        return facts
+
+
+def read_stored(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
+    """All channels as stored, float32 (height, width, channels): integers over their largest code, no transfer function
+    and no primaries. Raises as `image_facts`."""
+    path = Path(path)
+    with _opened(path) as (source, facts):
+        return image._read_pixels(source, source.spec(), list(range(len(facts.channels))), path, "float")
+
+
+def read_rgbd(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
+    """What Babylon.js reads of a PNG of RGBD: float32 (height, width, 3). Raises as `image_facts`."""
+    source = load(path)
+    pixels = decode_png(source)
+    if pixels.shape[2] != 4:
+        raise source.wrong("it has no alpha, in which RGBD has its divisor")
+    return unpack("rgbd", pixels, pixels.shape[:2])
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, ImageFacts]]:
+    size = image._regular_size(path)
+    if size == 0:
+        raise InputError(f"{path} is empty, an image file was expected")
+    import OpenImageIO as oiio
+
+    try:
+        with open(path, "rb") as file:
+            check_file(path, size, file.read(4096), [])
+        source = oiio.ImageInput.open(str(path))
+        complaint = image._complaint(oiio)
+        if source is None:
+            raise InputError(f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG"
+                             if "could not find a format reader" in complaint or not complaint else
+                             f"{path} is not a valid image: {image._reason(complaint, path)}")
+        try:
+            spec, form = source.spec(), source.format_name()
+            if form in image._NOT_IMAGES:
+                raise InputError(f"{path} is a file of kind {form}, an image was expected")
+            image._check_size(spec, path, size, form)
+            own: dict[str, Any] = {a.name.removeprefix(PREFIX): a.value for a in spec.extra_attribs
+                                   if a.name.startswith(PREFIX)}
+            yield source, ImageFacts(form, spec.full_width, spec.full_height, tuple(spec.channelnames),
+                                     str(spec.format), spec.get_string_attribute("compression"), own)
+        finally:
+            source.close()
+            image._complaint(source)
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+    except UnicodeError as error:
+        raise InputError(f"{path} is corrupted: its header holds text that is not UTF-8") from error
+    except MemoryError as error:
+        raise InputError(f"{path} needs more memory than this machine gives") from error
