@@ -185,8 +185,8 @@ def test_axis_forms():
 
 @pytest.mark.parametrize("arguments, code, words", [
     (("albdo", "-o", "t.npy"), 1, "albedo"),
-    (("albedo", "-o", "t.png"), 1, ".npy or .exr"),
-    (("albedo", "-o", "t"), 1, ".npy or .exr"),
+    (("albedo", "-o", "t.tga"), 1, ".dds or .h"),
+    (("albedo", "-o", "t"), 1, ".dds or .h"),
     (("albedo",), 1, "--output"),
     (("albedo", "-o", "t.npy", "--size", "0"), 1, "[1, 16384]"),
     (("albedo", "-o", "t.npy", "--size", "16385"), 1, "[1, 16384]"),

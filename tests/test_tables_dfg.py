@@ -153,7 +153,7 @@ def test_a_fitted_table_as_read(device: Device, tmp_path: Path) -> None:
     ({"as_read": True, "size": 1024}, "512"),
     ({"axes": {"NoV": "sqrt"}, "NoV": 0.5}, "no default axis"),
     ({"axes": {"NoV": "log"}}, "log"),
-    ({"scheme": "turquin"}, "energy has"),
+    ({"scheme": "turquin"}, "unknown scheme 'turquin'"),
 ])
 def test_refusals(tmp_path: Path, options: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):

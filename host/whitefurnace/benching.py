@@ -15,7 +15,7 @@ from whitefurnace import plan as planning
 from whitefurnace import source
 from whitefurnace.catalogue import integral, model
 from whitefurnace.catalogue.rule import AREA_RULES, LADDERS, Rule
-from whitefurnace.cells import over_nodes
+from whitefurnace.cells import over_cells, over_nodes
 from whitefurnace.convolution import HARMONICS_CHUNK, Convolver
 from whitefurnace.derived import numbers_of
 from whitefurnace.device import Device
@@ -407,6 +407,13 @@ def _dfg_closed(device: Device, precision: int, scale: int) -> Work:
                 _cells((0.01, 1), (0.01, 1), count=2048 * scale), 2, precision, LADDERS["light-angles"][4])
 
 
+def _glass(device: Device, precision: int, scale: int) -> Work:
+    slots = {slot: model(slot, name) for slot, name in (("ndf", "ggx"), ("masking", "smith"),
+                                                        ("fresnel", "dielectric"))}
+    return _sum(device, source.refraction(slots).text, "integrate",
+                _cells((0.01, 1), (0.01, 1), (0.4, 3), count=2048 * scale), 2, precision, LADDERS["refraction"][2])
+
+
 def _dfg_anisotropic(device: Device, precision: int, scale: int) -> Work:
     slots = {"ndf": model("ndf", "ggx_anisotropic"), "masking": model("masking", "smith")}
     return _sum(device, source.integration(integral("dfg"), slots).text, "integrate",
@@ -421,6 +428,18 @@ def _hemisphere(device: Device, precision: int, scale: int) -> Work:
 def _area(device: Device, precision: int, scale: int) -> Work:
     return _sum(device, source.area(model("ndf", "ggx")).text, "area", _cells((0, 1), (0.01, 1), count=4096 * scale), 1,
                 precision, AREA_RULES[32][1], azimuths=False)
+
+
+def _lobes(device: Device, precision: int, scale: int) -> Work:
+    """A step of the fit of linearly transformed cosines to GGX, of cosines as they are."""
+    slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith"), "fresnel": model("fresnel", "one")}
+    rule, soft = LADDERS["gauss"][4], np.dtype(f"f{precision // 8}").type(0.02)
+    cells = _cells((0, 1), (1, 1), (1, 1), (0, 0), (0, 0), (1, 1), (0.01, 1), count=1024 * scale)
+    polar, azimuthal = rule.tables()
+    between = [*map(np.int32, rule.counts), polar, np.int32(rule.azimuths), azimuthal, soft]
+    text = source.transformed(slots).text
+    return Work(lambda _: over_cells(device, text, "descend", cells, 19, precision, between),
+                float(cells.shape[1]) * rule.evaluations, precision / 8 * cells.shape[1] * (len(cells) + 19))
 
 
 def _radiance_light(device: Device, precision: int, scale: int) -> Work:
@@ -519,7 +538,9 @@ CASES = (
     Case("harmonics", "harmonics.cl", "node", "spherical harmonics to degree 2", _harmonics),
     Case("dfg", "integrate.cl", "evaluation", "split-sum pair, GGX with Smith's masking", _dfg),
     Case("dfg-closed", "dfg_ggx.cl", "evaluation", "split-sum pair, GGX, azimuth in closed form", _dfg_closed),
+    Case("glass", "glass.cl", "evaluation", "reflected and refracted by a rough boundary, GGX", _glass),
     Case("dfg-anisotropic", "stretched.cl", "evaluation", "split-sum pair, anisotropic GGX", _dfg_anisotropic),
+    Case("ltc", "ltc.cl", "evaluation", "a step of the fit of linearly transformed cosines, GGX", _lobes),
     Case("hemisphere", "hemisphere.cl", "evaluation", "albedo of a diffuse model, Burley's", _hemisphere),
     Case("area", "area.cl", "node", "projected area for the table of Smith's term", _area),
     Case("radiance-light", "radiance_outline.cl", "evaluation", "reflected radiance of an area light", _radiance_light),

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -46,16 +46,29 @@ class Kind:
     schemes: Sequence[str]
     make: Callable[..., tuple[Integrated, dict[str, Any]]]
     slot: str = "ndf"
+    fresnel: str | None = None  # the one model of Fresnel's term that it is of, else 1
+    axes: Mapping[str, tuple[float, float, int, str]] = field(default_factory=dict)  # usual ones beside its integral's
+    tolerance: float | None = None  # the usual one of float32, where it is not that of integrals
+    check: Callable[[Mapping[str, Chosen]], None] | None = None
+    digests: Callable[[Mapping[str, Chosen]], tuple[str, ...]] | None = None  # of kernels that are no integral's
+    of: str | None = None  # the integral that says which axes it has, where that is no albedo
+    shape: Callable[[str | None, Sequence[Any]], tuple[int, ...]] | None = None  # of coefficients, where it is a curve
+    axes_of: Callable[[Mapping[str, Chosen]], Mapping[str, tuple[float, float, int, str]]] | None = None
+    channels: int = 2
+    size: int | None = None  # where it is not that of all tables
+    fitted: bool = False  # a fit by itself, over x = roughness and y = √(1 - NoV), whose `make` takes their `middle`s
 
     def scheme_of(self, given: str | None) -> str | None:
         """The scheme asked for. Raises UsageError."""
         if given is None or (self.schemes and given in self.schemes):
             return given or (self.schemes[0] if self.schemes else None)
         if not self.schemes:
-            raise UsageError(f"{self.name} has no scheme; energy has")
+            raise UsageError(f"{self.name} has no scheme; energy, glass and ltc have")
         raise UsageError(f"unknown scheme {given!r}{nearest(given, self.schemes)}")
 
     def integral(self, scheme: str | None) -> str:
+        if self.of:
+            return self.of
         if self.slot == "fresnel":
             return "albedo_average"
         return "dfg" if scheme == "fdez_aguera" else "albedo"

@@ -183,6 +183,20 @@ def closed(file: str, slots: Mapping[str, Model]) -> Source:
     return _assemble(["real.clh", ("bindings", _bindings(slots)), *_models(slots, 0), file])
 
 
+def transformed(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
+    """The program that fits linearly transformed cosines to a specular BRDF and tells how far they are from it."""
+    cells = ("NoV", "per_albedo", "xx", "xz", "zx", "zz")
+    return _assemble(["real.clh", ("bindings", "#define HALF_ANGLE\n" + _bindings(slots, cells=cells,
+                                                                                 area_terms=area_terms)),
+                      *_models(slots, area_terms), "facet.clh", "ring.clh", "specular.clh", "ltc.cl"])
+
+
+def refraction(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
+    """The program of what a rough boundary reflects and refracts, of the slots ndf, masking and fresnel."""
+    return _assemble(["real.clh", ("bindings", _bindings(slots, area_terms=area_terms)), *_models(slots, area_terms),
+                      "glass.cl"])
+
+
 def area(ndf: Model) -> Source:
     """The program that makes the table of Smith's area."""
     return _assemble(["real.clh", ("bindings", "#define POLAR\n" + _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0),

@@ -9,40 +9,59 @@ import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from whitefurnace import bilinear
+from whitefurnace import bilinear, curves, glass, ltc
 from whitefurnace.catalogue import integral
 from whitefurnace.device import Device, choose_device
-from whitefurnace.energy import KINDS, fresnel_demand
+from whitefurnace.energy import KINDS as OF_ENERGY
+from whitefurnace.energy import Kind, fresnel_demand
+from whitefurnace.engines import Dfg, engines
 from whitefurnace.environments import environment as load
 from whitefurnace.errors import FileError, UnsupportedError, UsageError, nearest
 from whitefurnace.files import (
     Transaction,
+    check_table,
     digest_file,
+    identifier,
     read_manifest,
     release,
     scratch,
+    stored_format,
     write_exr,
     write_manifest,
     write_npy,
+    write_table,
+    write_text,
 )
 from whitefurnace.integrals import integrate
 from whitefurnace.radiance import ENVIRONMENT_TOLERANCE, radiance_demand
 from whitefurnace.recipe import Chosen, Spec, chosen, is_number
 from whitefurnace.run import DEFAULT_TOLERANCE, Demand, Integrated, demand, rows_of_roughness
+from whitefurnace.split_sum import CHARLIE
 from whitefurnace.version import VERSION
 
 SIZE = 128
 SIZES = (1, 16384)
-SCALES = ("linear", "log", "centres", "sqrt")
+SCALES = ("linear", "log", "centres", "sqrt", "f0", "angle")
 FITS = ("bilinear",)
 FITTED = (2, 512)
-CHANNELS = {1: ("Y",), 2: ("R", "G"), 3: ("R", "G", "B")}
-FORMS = (".npy", ".exr")
+CHANNELS = {1: ("Y",), 2: ("R", "G"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+FORMS = (".npy", ".exr", ".png", ".ktx2", ".dds", ".h")
+KINDS = {**OF_ENERGY, "glass": Kind("glass", "ggx", glass.SCHEMES, glass.glass, fresnel="dielectric",
+                                    axes={"ior": glass.IORS}, tolerance=glass.TOLERANCE, check=glass.check,
+                                    digests=glass.digests)}
+KINDS |= {name: Kind(name, "ggx", ltc.SCHEMES if "xx" in channels else (), partial(ltc.ltc, name), check=ltc.check,
+                     digests=ltc.digests, channels=len(channels), size=ltc.SIZE, fitted=True)
+          for name, channels in ltc.CHANNELS.items()}
+KINDS["smith"] = Kind("smith", "ggx", curves.SCHEMES, curves.smith, check=curves.smith_check, of="projected_area",
+                      axes=curves.SMITH_AXES, shape=curves.shape_of_smith)
+KINDS["norm"] = Kind("norm", "abc", (), curves.norm, check=curves.norm_check, of="normalization",
+                     axes_of=curves.norm_axes, shape=curves.shape_of_norm, tolerance=curves.NORM_TOLERANCE)
 OPTIONS = frozenset(inspect.signature(integrate).parameters) - {"parameters"}
 
 
@@ -51,9 +70,10 @@ class Axis:
     """A dimension of a table: `count` values of a parameter from `low` to `high`.
 
     The scales "linear", "log" and "sqrt" have the first value at `low` and the last at `high`, "sqrt" in equal steps of
-    the root of what is above `low`; "centres" has value k at low + (k + ½)(high - low)/count, where a texture is read.
-    `NoV` is the cosine of the view angle, `roughness` the perceptual roughness that every model with a roughness
-    follows, all else a parameter of the models.
+    the root of what is above `low`, "f0" of an index n in steps of ±F0^¼ = ±√(|n - 1|/(n + 1)), + above 1; "centres"
+    has value k at low + (k + ½)(high - low)/count, where a texture is read.
+    "angle" has equal steps of acos. `NoV` is the cosine of the view angle, `roughness` the perceptual roughness that
+    every model with a roughness follows, all else a parameter of the models.
     """
 
     name: str
@@ -69,12 +89,33 @@ class Axis:
             return np.geomspace(self.low, self.high, self.count)
         if self.scale == "sqrt":
             return self.low + (self.high - self.low) * np.linspace(0, 1, self.count) ** 2
+        if self.scale == "f0":
+            return self._indices(np.linspace(0, 1, self.count))
+        if self.scale == "angle":
+            return self._cosines(np.linspace(0, 1, self.count))
         return np.linspace(self.low, self.high, self.count)
+
+    def _cosines(self, share: np.ndarray) -> np.ndarray:
+        """Cosines at shares of an "angle" axis, its ends exact."""
+        first, last = math.acos(self.low), math.acos(self.high)
+        values = np.cos(first + (last - first) * share)
+        return np.where(share == 0, self.low, np.where(share == 1, self.high, values))
+
+    def _indices(self, share: np.ndarray) -> np.ndarray:
+        """Indices of refraction at shares of an "f0" axis."""
+        low, high = (math.copysign(math.sqrt(abs(n - 1) / (n + 1)), n - 1) for n in (self.low, self.high))
+        z = low + (high - low) * share
+        indices = (1 + z * np.abs(z)) / (1 - z * np.abs(z))
+        return np.where(share == 0, self.low, np.where(share == 1, self.high, indices))
 
     def at(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values and texel coordinates (0 is the first value) at shares in [0, 1] of the axis as it is read."""
         if self.scale == "log":
             values = self.low * (self.high / self.low) ** share
+        elif self.scale == "f0":
+            values = self._indices(share)
+        elif self.scale == "angle":
+            values = self._cosines(share)
         else:
             values = self.low + (self.high - self.low) * (share**2 if self.scale == "sqrt" else share)
         return values, share * self.count - 0.5 if self.scale == "centres" else share * (self.count - 1)
@@ -116,8 +157,11 @@ def axis(name: str, given: str | Sequence[Any] | Axis) -> Axis:
         raise UsageError(f"axis {name}: unknown scale {scale!r}{nearest(str(scale), SCALES)}")
     if not (math.isfinite(low) and math.isfinite(high)):
         raise UsageError(f"axis {name}: its ends must be finite")
-    if scale == "log" and not (low > 0 and high > 0):
-        raise UsageError(f"axis {name}: a log scale needs ends above 0, not {low:g} and {high:g}")
+    if scale in ("log", "f0") and not (low > 0 and high > 0):
+        raise UsageError(f"axis {name}: {'a log' if scale == 'log' else 'an f0'} scale needs ends above 0, not {low:g} "
+                         f"and {high:g}")
+    if scale == "angle" and not (abs(low) <= 1 and abs(high) <= 1):
+        raise UsageError(f"axis {name}: an angle scale is of cosines, from -1 to 1, not {low:g} and {high:g}")
     return Axis(name, low, high, _count(count, f"axis {name}: "), scale)
 
 
@@ -162,6 +206,9 @@ class Order:
     demand: Demand
     lit: Mapping[str, Any]
     around: Mapping[str, Any]
+    stored: str | None = None
+    charlie: bool = False
+    """Charlie's albedo as a third channel of a split-sum table."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -186,7 +233,10 @@ class Order:
                 "parameters": dict(self.fixed), "axes": [a.canonical() for a in self.axes],
                 "backfacing": self.backfacing, "precision": self.precision, "tolerance": self.tolerance,
                 **({"fit": self.fit} if self.fit else {}), **({"as_read_stated": True} if self.as_read else {}),
-                **({"scheme": self.scheme} if self.scheme else {}), **self.around, "format": self.path.suffix.lower()}
+                **({"scheme": self.scheme} if self.scheme else {}), **self.around,
+                **({"stored_format": self.stored} if self.stored else {}),
+                **({"charlie": True} if self.charlie else {}),
+                "format": self.path.suffix.lower()}
 
     def key(self) -> str:
         """sha256 over the recipe, the kernels and the version."""
@@ -208,29 +258,42 @@ class Table:
     seconds: float = 0.0
 
 
-def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence[int] = SIZE,
+def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence[int] | None = None,
           axes: Mapping[str, Any] | None = None, ndf: Spec | None = None, masking: Spec | None = None,
           fresnel: Spec | None = None, diffuse: Spec | None = None, brdf: Spec | None = None,
           light: Spec | None = None, environment: Any = None, normal: Sequence[float] | None = None,
           rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse", backfacing: str | None = None,
           precision: int = 32, tolerance: float | None = None, fit: str | None = None, as_read: bool = False,
-          scheme: str | None = None, force: bool = False,
+          scheme: str | None = None, stored: str | None = None, for_: str | None = None, force: bool = False,
           parameters: Mapping[str, Any] | None = None, **fixed: Any) -> Order:
     """A validated table; see `lut`. Raises UsageError, UnsupportedError, and what a user's file raises."""
     own = KINDS.get(kind)
+    preset = _preset(kind, for_, size, axes, scheme)
+    if preset:
+        size, scheme = preset.size, preset.form
+        axes = {name: (0.0, 1.0, preset.size, preset.NoV if name == "NoV" else "centres")
+                for name in (preset.x, preset.y)}
+    size = size if size is not None else (own and own.size) or SIZE
     scheme = own.scheme_of(scheme) if own else scheme
-    if own is None and scheme is not None:
-        raise UsageError(f"{kind} has no scheme; energy has")
+    if kind == "dfg":
+        scheme = _form(scheme)
+    elif own is None and scheme is not None:
+        raise UsageError(f"{kind} has no scheme; dfg, energy, glass and ltc have")
     entry = integral(own.integral(scheme) if own else kind)
     path = Path(path)
     form = path.suffix.lower()
     if form not in FORMS:
-        raise UsageError(f"{path}: a table is written as {' or '.join(FORMS)}, not {path.suffix or 'without a suffix'}")
+        raise UsageError(f"{path}: a table is written as {', '.join(FORMS[:-1])} or {FORMS[-1]}, not "
+                         f"{path.suffix or 'without a suffix'}")
     if precision not in DEFAULT_TOLERANCE:
         raise UsageError(f"precision {precision} is not one of {', '.join(map(str, DEFAULT_TOLERANCE))}")
-    if form == ".exr" and precision == 64:
-        raise UsageError("EXR holds float32: give .npy for precision 64")
+    if form not in (".npy", ".h") and precision == 64:
+        raise UsageError(f"{form[1:].upper()} holds float32 at most: give .npy or .h for precision 64")
     usual = DEFAULT_TOLERANCE if environment is None else ENVIRONMENT_TOLERANCE
+    if own and own.tolerance and (precision == 32 or own.shape):
+        usual = {**usual, precision: own.tolerance}
+    if own and own.shape and form not in (".npy", ".h"):
+        raise UsageError(f"{kind} is written as coefficients, to .h or .npy, not {form}")
     tolerance = usual[precision] if tolerance is None else tolerance
     if not is_number(tolerance) or not 0 < tolerance < 1:  # also NaN
         raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
@@ -239,12 +302,14 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
         raise UnsupportedError(f"{kind} is of Fresnel's term alone: give a fresnel, and no ndf, masking, diffuse or "
                                "brdf")
     if own and not lone and not (fresnel is None and diffuse is None and brdf is None):
-        raise UnsupportedError(f"{kind} is of an NDF and its masking; Fresnel's term is 1, and nothing else is added")
+        raise UnsupportedError(f"{kind} is of an NDF and its masking; Fresnel's term is {own.fresnel or '1'}, and "
+                               "nothing else is added")
     if ndf is None and diffuse is None and brdf is None and not lone:
         ndf = own.model if own else "ggx"
     if ndf is None and not lone and (masking is not None or fresnel is not None):
         raise UsageError(f"{'masking' if masking is not None else 'fresnel'} is of an NDF, and none is given")
-    given = {"ndf": ndf, "masking": masking or "smith", "fresnel": fresnel or "one", "diffuse": diffuse, "brdf": brdf}
+    given = {"ndf": ndf, "masking": masking or "smith", "fresnel": fresnel or (own and own.fresnel) or "one",
+             "diffuse": diffuse, "brdf": brdf}
     if lone:
         given = {"fresnel": fresnel or own.model}  # type: ignore[union-attr]
     # Chosen once: a user's file is read once, and what was read is what the key is of.
@@ -252,12 +317,19 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
     numbers = {name: _number(name, value) for name, value in {**(parameters or {}), **fixed}.items()}
     if lone and not axes:
         axes = _usual(models["fresnel"], numbers, _sizes(size)[0])
-    scaled = {name: given for name, given in (axes or {}).items() if given in SCALES}  # a default axis, scaled
-    explicit = {name: axis(name, given) for name, given in (axes or {}).items() if name not in scaled}
+    own_axes = {} if own is None else own.axes_of(models) if own.axes_of else own.axes
+    if "roughness" in own_axes and not any(_following(c, {*numbers, *(axes or {})}) for c in models.values()):
+        own_axes = {name: one for name, one in own_axes.items() if name != "roughness"}
+    axes = {**{name: own_axes[name] for name in own_axes if not {name, f"fresnel_{name}"} & {*numbers, *(axes or {})}},
+            **(axes or {})}
+    scaled = {name: given for name, given in axes.items() if given in SCALES}  # a default axis, scaled
+    explicit = {name: axis(name, given) for name, given in axes.items() if name not in scaled}
     for name in (*numbers, *explicit, *scaled):
         if name in OPTIONS:
             raise UsageError(f"{name} is an option and no parameter; a model's own of that name is SLOT_{name}")
-    placed = _placed(entry.view, models, _sizes(size), explicit, numbers, scaled)
+    placed = _placed(entry.view, models, _sizes(size), explicit, numbers, scaled, own is not None and own.fitted)
+    if preset:
+        placed = tuple(sorted(placed, key=lambda one: (preset.x, preset.y).index(one.name)))
     if form == ".exr" and len(placed) > 2:
         raise UsageError(f"EXR holds two axes, not {len(placed)}: give .npy")
     if not placed:
@@ -265,6 +337,9 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
     if fit is not None and fit not in FITS:
         raise UsageError(f"unknown fit {fit!r}{nearest(str(fit), FITS)}")
     as_read = as_read or fit is not None
+    if as_read and own and (own.fitted or own.shape):
+        raise UsageError(f"{kind} is a fit by itself, and states what is misplaced between texels: leave out --fit and "
+                         "--as-read")
     if as_read and not (len(placed) == 2 and all(FITTED[0] <= a.count <= FITTED[1] for a in placed)):
         raise UsageError(f"what is read between texels is told of tables with two axes of {FITTED[0]} to {FITTED[1]}")
     columns = _columns(placed, models, numbers)
@@ -273,11 +348,58 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
     asked = (fresnel_demand(models, columns) if lone else radiance_demand(light=lit.get("light"), **what) if lit else
              demand(entry.name, **what))
     if own and not lone:
-        asked = replace(asked, shape=(*asked.shape[:len(np.broadcast_shapes(*map(np.shape, columns.values())))], 2))
+        asked = replace(asked, shape=(*asked.shape[:len(np.broadcast_shapes(*map(np.shape, columns.values())))],
+                                      own.channels))
+    charlie = preset is not None and preset.charlie
+    if charlie:
+        cloth: dict[str, Any] = {**_charlie(models), **_columns(placed, _charlie(models), numbers)}
+        asked = replace(asked, shape=(*asked.shape[:-1], 3),
+                        digests=(*asked.digests, *demand("albedo", **cloth).digests))
+    if own and own.check:
+        own.check(models)
+    if own and own.shape:
+        asked = replace(asked, shape=own.shape(scheme, placed))
+    if own and own.digests:
+        asked = replace(asked, digests=(*asked.digests, *own.digests(models)))
     if form == ".exr" and asked.shape[2:] and asked.shape[2] not in CHANNELS:
-        raise UsageError(f"EXR holds 1 to 3 channels, not {asked.shape[2]}")
+        raise UsageError(f"EXR holds 1 to 4 channels, not {asked.shape[2]}: give .npy" +
+                         (", or write ltc_1 and ltc_2" if kind == "ltc" else ""))
+    rows, channels = asked.shape[:max(len(placed), 2)], math.prod(asked.shape[max(len(placed), 2):])
+    if form not in (".npy", ".exr") and not (own and own.shape):
+        check_table(form, rows, channels)
+    held = stored_format(form, channels, stored)
     return Order(kind, path, models, placed, numbers, backfacing, precision, float(tolerance), fit, as_read, scheme,
-                 force, columns, asked, lit, around)
+                 force, columns, asked, lit, around, held, charlie)
+
+
+FORMS_OF_DFG = ("scale_bias", "multiscatter")
+"""E = F0·A + B as (A, B), and as (∫Fc, ∫1) = (B, A + B) for mix(∫Fc, ∫1, F0): Schlick's F90 is 1."""
+
+
+def _form(scheme: str | None) -> str:
+    if scheme is not None and scheme not in FORMS_OF_DFG:
+        raise UsageError(f"unknown scheme {scheme!r}{nearest(scheme, FORMS_OF_DFG)}")
+    return scheme or FORMS_OF_DFG[0]
+
+
+def _preset(kind: str, for_: str | None, size: Any, axes: Any, scheme: Any) -> Dfg | None:
+    """The split-sum table of the engine that `--for` names. Raises UsageError."""
+    if for_ is None:
+        return None
+    if kind != "dfg":
+        raise UsageError(f"{kind} is no table of engines; dfg is")
+    found = engines(for_)
+    if len(found) > 1:
+        raise UsageError(f"{for_}: a table is for one engine")
+    for what, value in (("size", size), ("axis", axes), ("scheme", scheme)):
+        if value:
+            raise UsageError(f"--for {found[0].name} says the {what}: leave it out")
+    return found[0].dfg
+
+
+def _charlie(models: Mapping[str, Chosen]) -> dict[str, Chosen]:
+    """Charlie's lobe with the table's masking."""
+    return {"ndf": chosen("ndf", "charlie"), "masking": models["masking"]}
 
 
 def _lit(kind: str, light: Spec | None, around: Any, normal: Sequence[float] | None, rotate: float, exposure: float,
@@ -324,9 +446,11 @@ def _number(name: str, value: Any) -> float:
 
 
 def _placed(view: bool, models: Mapping[str, Chosen], sizes: tuple[int, int, bool], explicit: Mapping[str, Axis],
-            fixed: Mapping[str, float], scaled: Mapping[str, str] | None = None) -> tuple[Axis, ...]:
+            fixed: Mapping[str, float], scaled: Mapping[str, str] | None = None,
+            fitted: bool = False) -> tuple[Axis, ...]:
     """The axes in their order, x first: NoV where there is a view, roughness where some model's follows it and is not
-    given, each unless it is fixed and as given where it is; then the others."""
+    given, each unless it is fixed and as given where it is; then the others. Of a fit by itself roughness is x, from 0
+    to 1, and NoV = 1 - y²."""
     for name in explicit:
         if name in fixed:
             raise UsageError(f"{name} is given both as a number and as an axis")
@@ -337,14 +461,18 @@ def _placed(view: bool, models: Mapping[str, Chosen], sizes: tuple[int, int, boo
     taken = {*explicit, *fixed}
     if "roughness" not in fixed and any(_following(choice, taken) for choice in models.values()):
         defaults["roughness"] = Axis("roughness", 0.0, 1.0, down, "centres")
+    if fitted:
+        usual = {"roughness": Axis("roughness", 0.0, 1.0, across), "NoV": Axis("NoV", 1.0, 0.0, down, "sqrt")}
+        defaults = {name: one for name, one in usual.items() if name in defaults}
     for name, scale in (scaled or {}).items():
         if name not in defaults:
             raise UsageError(f"axis {name}: there is no default axis of that name to scale; give A:B:N:{scale}")
-        if scale == "log":
-            raise UsageError(f"axis {name}: a log scale needs ends above 0; give A:B:N:log")
+        if scale in ("log", "f0"):
+            raise UsageError(f"axis {name}: {'a log' if scale == 'log' else 'an f0'} scale needs ends above 0; give "
+                             f"A:B:N:{scale}")
         defaults[name] = replace(defaults[name], scale=scale)
     if both:
-        for name, count in (("NoV", across), ("roughness", down)):
+        for name, count in (("NoV", down if fitted else across), ("roughness", across if fitted else down)):
             if name not in defaults or name in explicit:
                 raise UsageError(f"size {across}x{down}: there is no default axis {name} for the {count}; give one "
                                  "number")
@@ -393,20 +521,28 @@ Progress = Callable[[str, str, float], None]
 
 def lut(kind: str, path: str | os.PathLike[str], *, device: Device | str | None = None, dry_run: bool = False,
         progress: Progress | None = None, **options: Any) -> Table:
-    """Writes a table of any integral to `path` (.npy or .exr), and beside it `path.json`, last, which proves it whole.
+    """Writes a table of any integral to `path`, and beside it `path.json`, last, which proves it whole.
 
-    kind is an integral's name, "energy" (what multiple scattering gives back, `scheme` "kulla_conty", "turquin" or
-    "fdez_aguera"), "sheen" or "fresnel_average". options: size (N, (N, M) or "NxM"; 128), axes ({name: (A, B, N[,
-    "linear" | "log" | "centres" | "sqrt"])}, or a scale alone for a default axis), fit ("bilinear": texels that read
-    best, of two axes), as_read (state errors between texels; a fit does), ndf (`ggx` unless there is a diffuse or
-    brdf), masking, fresnel, diffuse, brdf, backfacing, precision, tolerance, force, for radiance light or environment,
-    normal, rotate, exposure, nonfinite, and parameters, as one number each, by name or as a mapping.
+    kind is an integral's name ("dfg" by `scheme` "scale_bias" or "multiscatter", or `for_` an engine, which says size,
+    axes and form), "energy" (what multiple scattering gives back, `scheme` "kulla_conty", "turquin" or
+    "fdez_aguera"), "sheen", "fresnel_average" or "ltc" (linearly transformed cosines, `scheme` "free" or "heitz",
+    as one array or as the textures "ltc_1" and "ltc_2"), "glass" (what a rough boundary reflects and lets through,
+    `scheme` "entering" or "leaving"), "smith" or "norm" (coefficients of simpler curves, to .h or .npy). `path` ends
+    with .npy, .exr, .png, .ktx2, .dds or .h.
+
+    options: size (N, (N, M) or "NxM"; 128, 64 for ltc), axes ({name: (A, B, N[, "linear" | "log" | "centres" | "sqrt" |
+    "f0" | "angle"])}, or a scale alone for a default axis), stored (the format of texels, as "rg16f" or "r8"), fit
+    ("bilinear": texels that read best, of two axes), as_read (state errors between texels; a fit does), ndf (`ggx`
+    unless there is a diffuse or brdf), masking, fresnel, diffuse, brdf, backfacing, precision, tolerance, force, for
+    radiance light or environment, normal, rotate, exposure, nonfinite, and parameters, as one number each, by name or
+    as a mapping.
 
     The array is […, y, x(, c)] of float32 or float64. x is NoV = (x + ½)/N for integrals with a view, y perceptual
-    roughness r = (y + ½)/M, row 0 smoothest, which the models' own parameters follow; without a view r alone is x. A
-    parameter that is given stays put; an axis of the same name replaces a default one, others come after it, slower,
-    in their order. More than two want .npy. What exists with the same key is skipped, what the manifest proves ours
-    replaced, and anything else needs `force`. Raises UsageError, UnsupportedError, FileError, CheckError, DeviceError.
+    roughness r = (y + ½)/M, row 0 smoothest, which the models' own parameters follow; without a view r alone is x; of
+    ltc x is r from 0 to 1 and NoV = 1 - y². A parameter that is given stays put; an axis of the same name replaces a
+    default one, others come after it, slower, in their order. More than two want .npy, .h, .ktx2 or .dds. What exists
+    with the same key is skipped, what the manifest proves ours replaced, and anything else needs `force`. Raises
+    UsageError, UnsupportedError, FileError, CheckError, DeviceError.
     """
     return make(order(kind, path, **options), device, dry_run=dry_run, progress=progress)
 
@@ -444,7 +580,7 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
         if request.fit:
             result = _fitted(request, on, out, told)
         else:
-            result = _values(request, on, request.columns, request.tolerance, told, out, tell)
+            result = _values(request, on, request.axes, request.tolerance, told, out, tell)
         if request.as_read:
             told["as_read"] = _as_read(request, on, out)
         made.append(replace(result, values=np.empty(0)))  # the file has them; what is held would keep it mapped
@@ -452,8 +588,15 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
     with Transaction() as transaction:
         if request.path.suffix.lower() == ".npy":
             write_npy(request.path, request.shape, request.dtype, fill, into=transaction)
+        elif request.kind in KINDS and KINDS[request.kind].shape:
+            fill(np.empty(request.shape, request.dtype))
+            write_text(request.path, curves.header(identifier(request.path.stem), told["text"], VERSION),
+                       into=transaction)
+        elif request.path.suffix.lower() != ".exr":
+            _texture(request, key, fill, made, told, transaction)
         else:
             _exr(request, key, fill, made, told, transaction)
+        told.pop("text", None)  # of a header
         staged = transaction.staged(request.path)
         manifest = {**_manifest(request, key, on, made[0]), **told}
         manifest |= {"sha256": digest_file(staged), "bytes": staged.stat().st_size}
@@ -463,18 +606,64 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
                    seconds=time.perf_counter() - begin)
 
 
-def _values(request: Order, on: Device, columns: Mapping[str, np.ndarray], tolerance: float,
+def _values(request: Order, on: Device, points: Sequence[Axis | Points], tolerance: float,
             told: dict[str, Any] | None = None, out: np.ndarray | None = None,
             progress: Callable[[float], None] | None = None) -> Integrated:
-    """The table's values at columns, […, c]; `told` is what is to be said of them."""
+    """The table's values at points of its axes, […, c]; `told` is what is to be said of them."""
+    columns = request.columns if points is request.axes else _columns(points, request.models, request.fixed)
     what: dict[str, Any] = {**request.models, **columns, "backfacing": request.backfacing, "device": on,
                             "precision": request.precision, "tolerance": tolerance, "out": out}
     if request.kind in KINDS:
+        if KINDS[request.kind].shape:
+            what |= {"axes": request.axes, "columns_of": lambda points: _columns(
+                [Points(name, values) for name, values in points], request.models, request.fixed)}
+        if KINDS[request.kind].fitted:
+            what["middle"] = _middle(request)
         result, facts = KINDS[request.kind].make(request.scheme, told is not None, **what)
         if told is not None:
             told |= facts
         return result
+    if request.kind == "dfg":
+        return _split_sum(request, points, told, progress, what)
     return integrate(request.kind, progress=progress, **request.lit, **what)
+
+
+def _split_sum(request: Order, points: Sequence[Axis | Points], told: dict[str, Any] | None,
+               progress: Callable[[float], None] | None, what: dict[str, Any]) -> Integrated:
+    """(…, 2 or 3): the pairs in the form asked for, with Charlie's albedo where an engine has it."""
+    out = what["out"]
+    made = integrate("dfg", progress=progress, **{**what, "out": None if request.charlie else out})
+    facts: dict[str, Any] = {"channels": ["scale", "bias"], "formula": "E(v; F0) = F0 scale + bias"}
+    if request.scheme == "multiscatter":
+        made.values[..., 0] += made.values[..., 1]
+        made.values[...] = made.values[..., ::-1].copy()
+        made = replace(made, error=2 * made.error)
+        facts = {"channels": ["∫Fc", "∫1"], "formula": "E(v; F0) = mix(∫Fc, ∫1, F0)"}
+    if request.charlie:
+        models = _charlie(request.models)
+        cloth = integrate("albedo", **{**what, **models, **_columns(points, models, request.fixed), "out": None,
+                                       "tolerance": max(request.tolerance, CHARLIE)})
+        values = np.concatenate([made.values, np.broadcast_to(cloth.values, made.values.shape[:-1])[..., None]], -1)
+        if out is not None:
+            out[...] = values
+        made = replace(made, values=values if out is None else out, evaluations=made.evaluations + cloth.evaluations,
+                       notices=(*made.notices, *cloth.notices))
+        facts |= {"channels": [*facts["channels"], "charlie"], "charlie_error": float(cloth.error)}
+    if told is not None:
+        told |= facts
+    return made
+
+
+def _middle(request: Order) -> dict[str, np.ndarray] | None:
+    """The columns where a read lies in the middle of four texels; None where the axes are not two with two texels."""
+    if len(request.axes) != 2 or min(a.count for a in request.axes) < 2:
+        return None
+    points = []
+    for one in request.axes:
+        k = np.arange(one.count - 1)
+        points.append(Points(one.name, one.at((k + 1) / one.count if one.scale == "centres" else
+                                              (k + 0.5) / (one.count - 1))[0]))
+    return _columns(points, request.models, request.fixed)
 
 
 def _at(request: Order, on: Device, shares: Sequence[np.ndarray], tolerance: float) -> tuple[Any, ...]:
@@ -485,7 +674,7 @@ def _at(request: Order, on: Device, shares: Sequence[np.ndarray], tolerance: flo
         values, x = one.at(share)
         points.append(Points(one.name, values))
         weights.append(bilinear.hats(one.count, x))
-    made = _values(request, on, _columns(points, request.models, request.fixed), tolerance)
+    made = _values(request, on, points, tolerance)
     down = points[1]
     counted = down.given >= bilinear.LEAST if down.name == "roughness" else np.ones(down.given.size, bool)
     truth = np.asarray(made.values, np.float64).reshape(down.given.size, points[0].given.size, -1)
@@ -497,8 +686,8 @@ def _fitted(request: Order, on: Device, out: np.ndarray, told: dict[str, Any]) -
     shares = [np.concatenate([[0.0], (np.arange(n) + 0.5) / n, [1.0]])
               for n in (bilinear.SAMPLES * a.count for a in request.axes)]
     truth, down, across, counted, made = _at(request, on, shares, request.tolerance)
-    if request.kind in KINDS:
-        _values(request, on, request.columns, request.tolerance, told)
+    if request.kind in KINDS or request.kind == "dfg":
+        _values(request, on, request.axes, request.tolerance, told)
     out[...] = bilinear.fit(truth, down, across, counted).reshape(out.shape)
     return replace(made, values=out)
 
@@ -509,7 +698,7 @@ def _as_read(request: Order, on: Device, out: np.ndarray) -> dict[str, Any]:
     # Of points where no fit looked, and the ends.
     shares = [np.concatenate([[0.0], (np.arange(n) + 0.37) / n, [1.0]]) for n in (5 * a.count for a in request.axes)]
     truth, down, across, counted, _ = _at(request, on, shares, request.tolerance)
-    there = np.asarray(_values(request, on, request.columns, request.tolerance).values, np.float64)
+    there = np.asarray(_values(request, on, request.axes, request.tolerance).values, np.float64)
     rows = request.axes[1].values()
     at = rows >= bilinear.LEAST if request.axes[1].name == "roughness" else np.ones(rows.size, bool)
     return {"counted": f"roughness from {bilinear.LEAST}; max_all from the axis's end",
@@ -529,6 +718,28 @@ def _exr(request: Order, key: str, fill: Callable[[np.ndarray], None], made: lis
                 if name not in ("name", "whitefurnace")}
         write_exr(request.path, cells.reshape(*request.shape[:2], channels), channel_names=CHANNELS[channels],
                   attributes={"whitefurnace:version": VERSION, **texts}, into=transaction)
+
+
+def _texture(request: Order, key: str, fill: Callable[[np.ndarray], None], made: list[Integrated],
+             told: dict[str, Any], transaction: Transaction) -> None:
+    """PNG, KTX 2, DDS and C, and what storing costs beside the table's error."""
+    cells = np.empty(request.shape, request.dtype)
+    fill(cells)
+    whole = {**_manifest(request, key, None, made[0]), **told}
+    texts = {f"whitefurnace:{name}": value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+             for name, value in whole.items() if name not in ("name", "whitefurnace")}
+    dimensions = max(len(request.axes), 2)
+    order_ = ", ".join(["wvuzyx"[-dimensions:][k] for k in range(dimensions)])
+    comment = [f"{request.kind} of " + ", ".join(f"{slot} {c.model.name}" for slot, c in request.models.items()) +
+               f", as [{order_}{', channel' if len(request.shape) > dimensions else ''}]; whitefurnace {VERSION}",
+               *(f"{name}: {along}" for name, along in zip("xyzuvw", request.axes, strict=False)),
+               *(f"{name} = {value:g}" for name, value in request.fixed.items()),
+               *([f"channels: {', '.join(told['channels'])}"] if "channels" in told else []),
+               *([told["formula"]] if "formula" in told else []),
+               f"error of a value: {made[0].error:.2g}"]
+    stored = write_table(request.path, cells.reshape(*request.shape[:dimensions], -1), request.stored,
+                         slack=made[0].error, texts=texts, comment=comment, into=transaction)
+    told["stored"] = {"format": stored.format, "error": stored.error}
 
 
 def _manifest(request: Order, key: str, device: Device | None, made: Integrated) -> dict[str, Any]:

@@ -16,10 +16,14 @@ PAPERS = {
     "Fujii2012": "Y. Fujii, A Tiny Improvement of Oren-Nayar Reflectance Model, 2012",
     "Goldfarb1983": "D. Goldfarb, A. Idnani, A Numerically Stable Dual Method for Solving Strictly Convex Quadratic "
                     "Programs, Mathematical Programming 27, 1983",
+    "Hammon2017": "E. Hammon, PBR Diffuse Lighting for GGX+Smith Microsurfaces, GDC 2017",
     "Heitz2014": "E. Heitz, Understanding the Masking-Shadowing Function in Microfacet-Based BRDFs, JCGT 3(2), 2014",
+    "Heitz2016": "E. Heitz, J. Dupuy, S. Hill, D. Neubelt, Real-Time Polygonal-Light Shading with Linearly Transformed "
+                 "Cosines, ACM TOG 35(4), 2016",
     "Hoffman2012": "N. Hoffman, Background: Physics and Math of Shading, SIGGRAPH 2012 course",
     "Kahan1965": "W. Kahan, Further Remarks on Reducing Truncation Errors, Communications of the ACM 8(1), 1965",
     "Karis2013": "B. Karis, Real Shading in Unreal Engine 4, SIGGRAPH 2013 course",
+    "Karis2014": "B. Karis, Physically Based Shading on Mobile, Unreal Engine blog, 2014",
     "Kelemen2001": "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with Importance "
                    "Sampling, Eurographics short presentations, 2001",
     "Krivanek2008": "J. Křivánek, M. Colbert, Real-Time Shading with Filtered Importance Sampling, CGF 27(4), 2008",
@@ -30,6 +34,8 @@ PAPERS = {
                   "1961",
     "Low2012": "J. Löw et al., BRDF Models for Accurate and Efficient Rendering of Glossy Surfaces, ACM TOG 31(1), "
                "2012",
+    "Marquardt1963": "D. W. Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters, SIAM J. "
+                     "Appl. Math. 11(2), 1963",
     "McCalpin1995": "J. McCalpin, Memory Bandwidth and Machine Balance in Current High Performance Computers, IEEE "
                     "TCCA Newsletter, 1995",
     "Minnaert1941": "M. Minnaert, The Reciprocity Principle in Lunar Photometry, Astrophysical Journal 93, 1941",
@@ -41,9 +47,12 @@ PAPERS = {
                        "SIGGRAPH 2001",
     "Schlick1994": "C. Schlick, An Inexpensive BRDF Model for Physically-Based Rendering, CGF 13(3), 1994",
     "Shirley1997": "P. Shirley et al., A Practitioners' Assessment of Light Reflection Models, Pacific Graphics 1997",
+    "Snyder1996": "J. Snyder, Area Light Sources for Real-Time Graphics, Microsoft Research MSR-TR-96-11, 1996",
     "Turquin2019": "E. Turquin, Practical Multiple Scattering Compensation for Microfacet Models, Industrial Light & "
                    "Magic, 2019",
     "VanOosterom1983": "A. Van Oosterom, J. Strackee, The Solid Angle of a Plane Triangle, IEEE TBME 30(2), 1983",
     "Vogel1979": "H. Vogel, A Better Way to Construct the Sunflower Head, Mathematical Biosciences 44, 1979",
     "Walter2007": "B. Walter et al., Microfacet Models for Refraction through Rough Surfaces, EGSR 2007",
+    "Weiszfeld1937": "E. Weiszfeld, Sur le point pour lequel la somme des distances de n points donnés est minimum, "
+                     "Tôhoku Mathematical Journal 43, 1937",
 }

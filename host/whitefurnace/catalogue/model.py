@@ -59,6 +59,8 @@ class Model:
     needs: tuple[str, ...] = ()
     isotropic: bool = True
     from_roughness: Callable[[float], dict[str, float]] | None = None
+    past_one: Callable[[float], dict[str, float]] | None = None
+    """The same for roughnesses over 1, which some engines' last mips have; None where r = 1 is the end."""
     facts: Mapping[str, Any] = field(default_factory=dict)
     constants: Callable[..., dict[str, np.ndarray]] | None = None
     constant_names: tuple[str, ...] = ()

@@ -58,6 +58,9 @@ CLOSED = {("dfg", "ggx", "smith"): "dfg_ggx.cl", ("dfg", "ggx", "smith_separable
 LOBE = Integral("lobe", "The prefilter's lobe", 1, ("NDF_D",), "LOBE", False,
                 "∫ K dω of K(l·r) = D(h)(n·l) with n = v = r")
 
+REFRACTION = Integral("refraction", "Reflected and refracted", 2, ("NDF_D", "MASKING_V", "MASKING_G1", "FRESNEL_F"),
+                      "POLAR", True, "(R, T) of a rough boundary of two insulators, of what arrives along v")
+
 
 def integral(name: str) -> Integral:
     """The integral `name`. Raises UsageError with the nearest name."""

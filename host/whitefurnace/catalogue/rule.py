@@ -63,6 +63,9 @@ LADDERS = {
     # dfg_ggx.cl: three panels over the light's polar angle, an azimuth in closed form but for Schlick's part
     "light-angles": _ladder("light-angles", 3, (0, 10, 9), (0, 12, 10), (0, 14, 11), (0, 18, 13), (0, 22, 16),
                             (0, 28, 24), (0, 36, 36), (0, 48, 64)),
+    # glass.cl: three panels for what is reflected, four for what is refracted
+    "refraction": _ladder("refraction", 7, (0, 8, 8), (0, 10, 10), (0, 12, 14), (0, 16, 18), (0, 20, 24), (0, 28, 32),
+                          (0, 36, 40), (0, 48, 56), (0, 64, 72), (0, 96, 104), (0, 144, 144)),
     # ring.clh without an azimuth: normalization
     "polar": _ladder("polar", 1, (12, 12, 1), (16, 18, 1), (20, 24, 1), (28, 32, 1), (40, 44, 1), (56, 64, 1),
                      (80, 88, 1), (112, 128, 1), (168, 192, 1), (256, 288, 1)),

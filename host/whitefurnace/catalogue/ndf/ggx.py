@@ -31,6 +31,7 @@ ENTRY = Model(
     provides=("NDF_D", "NDF_AREA", "NDF_WIDTH", "NDF_SAMPLE"),
     reference={"D": _d, "area": _area},
     from_roughness=lambda r: {"alpha": alpha_within(r, ALPHA)},
+    past_one=lambda r: {"alpha": r * r},  # thin at the pole then, and still a density
     facts={
         "normalized": True,
         "projected area": "closed",
