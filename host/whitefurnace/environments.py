@@ -6,7 +6,8 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -16,7 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import FileError, InputError, UsageError
-from whitefurnace.files import decode_srgb, read_image
+from whitefurnace.files import (
+    decode_srgb,
+    digest_file,
+    is_light,
+    light_digest,
+    light_files,
+    read_image,
+    read_radiance,
+)
 
 FACES = ("+X", "-X", "+Y", "-Y", "+Z", "-Z")
 FACE_NAMES = (
@@ -132,7 +141,8 @@ def environment(
 ) -> Environment:
     """The environment of an image file, a folder of six faces, an array or another environment.
 
-    source     an image in one of `LAYOUTS` (a 1 x 1 image is a constant); a folder with six square images
+    source     an image in one of `LAYOUTS` (a 1 x 1 image is a constant); a .ktx, .ktx2, .dds, .env, .gltf or .glb
+               file, of which level 0 is taken, a cube or such an image; a folder with six square images
                named px nx py ny pz nz, posx negx ... or right left top bottom front back (front is +Z); an
                array (h, w) or (h, w, 1 | 3 | 4) of such an image, or (6, n, n) or (6, n, n, 1 | 3 | 4), of
                floats (linear Rec.709) or uint8 or uint16 (sRGB)
@@ -162,7 +172,9 @@ def environment(
         )
     elif isinstance(source, (str, os.PathLike)):
         path = Path(source)
+        before = _stamps(path)
         found = _from_folder(path, zero) if os.path.isdir(path) else _from_image(path, zero)
+        _check_unchanged(path, before, found.digest)
         found = replace(found, rotation=turn)
     elif isinstance(source, np.ndarray):
         found = replace(_from_array(source, zero), rotation=turn)
@@ -181,12 +193,68 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
 
 
+def source_files(source: str | os.PathLike[str]) -> list[Path]:
+    """The files that `environment` reads of a path. Raises as it does for a folder without faces."""
+    path = Path(source)
+    return _face_paths(path) if os.path.isdir(path) else light_files(path)
+
+
+def source_digest(source: str | os.PathLike[str]) -> str:
+    """The `digest` of the environment at a path, without decoding it. Raises `FileError`, `InputError`."""
+    path = Path(source)
+    if os.path.isdir(path):
+        return _of_faces(digest_file(face) for face in _face_paths(path))
+    return light_digest(path)
+
+
+def _of_faces(digests: Iterable[str]) -> str:
+    return hashlib.sha256("".join(digests).encode()).hexdigest()
+
+
+_FRESH = 2_000_000_000  # ns: the coarsest times that file systems keep (FAT), and far over a kernel's tick
+
+
+def _stamps(path: Path) -> tuple[tuple[int, ...], ...] | None:
+    """What changes when the files of a path are written to; None where they cannot be listed, as reading will say."""
+    try:
+        return tuple((s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
+                     for s in (os.stat(file) for file in source_files(path)))
+    except (OSError, ValueError, FileError, InputError):
+        return None
+
+
+def _check_unchanged(path: Path, before: tuple[tuple[int, ...], ...] | None, digest: str) -> None:
+    """Refuses a source that was written to between the digest and the last pixel: the manifest would say of one what
+    was made of another. Raises `FileError`."""
+    after = _stamps(path)
+    changed = before is None or after != before
+    # A second write within a tick of the clock leaves the times as they were; its bytes tell.
+    if not changed and max(max(s[3:]) for s in after or ((0,),)) > time.time_ns() - _FRESH:
+        changed = source_digest(path) != digest
+    if changed:
+        raise FileError(f"{path} changed while it was read; run this again when it is whole")
+
+
 def _from_image(path: Path, zero: bool) -> Environment:
+    if is_light(path):
+        return _from_container(path, zero)
     image = read_image(path)
     layout = _layout_of(image.pixels.shape, str(path))
     notices = list(image.notices)
     _clean(image.pixels[None], layout, str(path), zero, notices)
     return _placed(image.pixels, layout, path.stem, image.digest, notices)
+
+
+def _from_container(path: Path, zero: bool) -> Environment:
+    """Level 0 of a cube, or a 2-D texture in one of the layouts."""
+    pixels, cube = read_radiance(path)
+    notices: list[str] = []
+    if cube:
+        _clean(pixels, None, str(path), zero, notices)
+        return _cube(pixels, path.stem, "cube", light_digest(path), notices)
+    layout = _layout_of(pixels.shape, str(path))
+    _clean(pixels[None], layout, str(path), zero, notices)
+    return _placed(pixels, layout, path.stem, light_digest(path), notices)
 
 
 def _from_array(array: npt.NDArray[Any], zero: bool) -> Environment:
@@ -236,7 +304,7 @@ def _from_folder(folder: Path, zero: bool) -> Environment:
     for face, image in zip(cube, images, strict=True):
         have = image.pixels.shape[2]
         face[..., : max(have, 3)] = image.pixels  # grey spreads over the three
-    digest = hashlib.sha256("".join(image.digest for image in images).encode()).hexdigest()
+    digest = _of_faces(image.digest for image in images)
     return _cube(cube, folder.resolve().name, "six faces", digest, notices)
 
 
@@ -287,15 +355,27 @@ def _cells(layout: Layout, height: int, width: int) -> Iterator[tuple[slice, sli
         yield slice(row * n, (row + 1) * n), slice(column * n, (column + 1) * n), turns
 
 
+def faces_of(pixels: npt.NDArray[np.float32]) -> tuple[str, npt.NDArray[np.float32]] | None:
+    """The layout that an image (h, w, c) has by its aspect ratio, and its texels: as they are for a lat-long, else the
+    faces (6, n, n, c), GL-direct. None where no layout has it."""
+    try:
+        layout = _layout_of(pixels.shape, "the image")
+    except InputError:
+        return None
+    if not layout.cells:
+        return layout.name, pixels
+    height, width, _ = pixels.shape
+    return layout.name, np.stack([np.rot90(pixels[rows, columns], turns)
+                                  for rows, columns, turns in _cells(layout, height, width)])
+
+
 def _placed(
     pixels: npt.NDArray[np.float32], layout: Layout, name: str, digest: str, notices: list[str]
 ) -> Environment:
     if layout.cells:
-        height, width, _ = pixels.shape
-        faces = [
-            np.rot90(pixels[rows, columns], turns) for rows, columns, turns in _cells(layout, height, width)
-        ]
-        return _cube(np.stack(faces), name, layout.name, digest, notices)
+        found = faces_of(pixels)
+        assert found is not None
+        return _cube(found[1], name, layout.name, digest, notices)
     return _made("latlong", pixels, name, layout.name, digest, notices)
 
 

@@ -24,6 +24,8 @@ from whitefurnace.files import write_atomic
 from whitefurnace.run import integrate
 
 if TYPE_CHECKING:
+    from whitefurnace.comparison import Comparison
+    from whitefurnace.comparison import Row as Compared
     from whitefurnace.tradeoff import Cost, Point
     from whitefurnace.verification import Row
 
@@ -144,6 +146,69 @@ def draw_tradeoff(folder: Path, points: Sequence[Point], costs: Sequence[Cost], 
         path = folder / "tradeoff.png"
         write_atomic(path, partial(figure.savefig, format="png", dpi=DPI, metadata={"Software": None}))
     return path
+
+
+CROSS = ((1, 2), (1, 0), (0, 1), (2, 1), (1, 1), (1, 3))
+"""Row and column of +X -X +Y -Y +Z -Z in a horizontal cross (environments.LAYOUTS)."""
+
+
+def draw_comparison(folder: Path, found: Comparison) -> Path:
+    """`folder`/compare.png: a map of the errors of each level, cubes as crosses, and of each channel of a table.
+
+    Raises as `draw` does.
+    """
+    require()
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot make {folder}: {error.strerror or error}") from error
+    # The colours of one file's maps are alike: five decades down from the worst.
+    shown = [row for row in found.rows if row.errors is not None]
+    largest = {kind: max((row.worst for row in shown if row.kind == kind and math.isfinite(row.worst)), default=1.0)
+               for kind in ("level", "table")}
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(STYLE)
+        figure = Figure(dpi=DPI, facecolor="white")
+        FigureCanvasAgg(figure)
+        panels = [_Panel(partial(_error_map, figure, row, largest[row.kind] or 1.0), 4.6, after=0.5) for row in shown]
+        _lay(figure, [(3.45, panels[k:k + 2]) for k in range(0, len(panels), 2)])
+        _title(figure, "Errors of A against B", f"{found.a.path.name}  against  {found.b.path.name}", "0.35")
+        path = folder / "compare.png"
+        write_atomic(path, partial(figure.savefig, format="png", dpi=DPI, metadata={"Software": None}))
+    return path
+
+
+def _error_map(figure: Figure, row: Compared, largest: float, axes: Axes) -> None:
+    import matplotlib
+    from matplotlib.colors import LogNorm
+
+    errors = np.asarray(row.errors, np.float64)
+    if errors.ndim == 3 and errors.shape[0] == 6 and row.kind == "level":
+        n = errors.shape[1]
+        flat = np.full((3 * n, 4 * n), np.nan)
+        for face, (down, across) in zip(errors, CROSS, strict=True):
+            flat[down * n:(down + 1) * n, across * n:(across + 1) * n] = face
+    else:
+        flat = errors.reshape(-1, errors.shape[-1])
+    colours = matplotlib.colormaps["cividis"]
+    colours = colours.with_extremes(bad=(1, 1, 1, 0), under=colours(0.0), over=RED)
+    axes.grid(False)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_visible(False)
+    flat = np.clip(flat, 1e-300, 1e300)  # the logarithm of 0, and of what is not finite in one file
+    image = axes.imshow(np.ma.masked_invalid(flat), cmap=colours, norm=LogNorm(1e-5 * largest, largest),
+                        interpolation="nearest")
+    roughness = "" if row.roughness is None else f", r = {row.roughness:.3g}"
+    axes.set_title(f"{row.part}, {row.size}{roughness}: {_small(row.error)}, worst {_small(row.worst)}"
+                   if math.isfinite(row.worst) else f"{row.part}, {row.size}{roughness}: red is not finite")
+    _bar(figure, axes, image, extend="both")
 
 
 def _tradeoff(points: Sequence[Point], axes: Axes) -> None:
