@@ -64,9 +64,10 @@ def test_lod_and_roughness_are_inverse(levels):
         r = roughness_of_level(k, levels)
         assert lod_of_roughness(r, levels) == pytest.approx(k, abs=1e-12)
         assert roughness_of_lod(k, levels) == r
-    assert (hats(np.array([roughness_of_level(k, levels) for k in range(levels)]), levels) ==
+    recipe = chain(levels=levels)
+    assert (hats(np.array([roughness_of_level(k, levels) for k in range(levels)]), recipe) ==
             pytest.approx(np.eye(levels), abs=1e-12))
-    assert hats(scored(), levels).sum(1) == pytest.approx(np.ones(len(scored())), abs=1e-12)
+    assert hats(scored(), recipe).sum(1) == pytest.approx(np.ones(len(scored())), abs=1e-12)
 
 
 # ------------------------------------------------------------------------------------------- reads
@@ -228,7 +229,7 @@ def test_between_levels_a_harmonic_errs_as_funk_and_hecke_say(device: Device, de
     found = reader.as_read(recipe, texels=False)
     t = np.array([transform(degree, float(r)) for r in scored()])
     levels = np.array([1.0] + [transform(degree, r) for _, r in recipe.levels[1:]])
-    read = hats(scored(), 5) @ levels
+    read = hats(scored(), chain()) @ levels
     P = 0.9 * legendre(reader.d[1])
     want = np.sqrt((((read - t)[:, None] * P / (1 + t[:, None] * P)) ** 2).mean(1))
     rough = scored() > recipe.levels[1][1]  # below, the mirror is a texel and not the function in it
@@ -426,7 +427,8 @@ def test_a_bake_states_what_engines_show(capsys, tmp_path, image, options):
     code, rows, text = shell(capsys, "bake", image, "-o", out, "--size", "32", "--min-size", "8", "--json", *options)
     assert code == 0, text
     manifest = json.loads((out / "room.json").read_text())
-    found = manifest["as_read"]
+    (found,) = manifest["as_read"]
+    assert found["for"] == "raw"
     assert set(found["parts"]) == {"between", "texels", "levels", "format", "all"}
     assert found["parts"]["levels"]["mean"] <= 1e-3  # the levels' tolerance
     assert found["fit"] == (options[1] if len(options) == 2 else None)

@@ -16,7 +16,7 @@ from whitefurnace.lobes import COSINE, Lobe, mixture_lobe, ndf_lobe
 from whitefurnace.means import Means
 from whitefurnace.octahedral import Classes, octahedral_of
 from whitefurnace.recipe import CERTIFIED
-from whitefurnace.sphere import Shape, source_directions
+from whitefurnace.sphere import POINTS, Shape, octahedral_means, source_directions
 from whitefurnace.stratum import nearest_texels
 from whitefurnace.texels import Texels
 
@@ -307,10 +307,17 @@ class Convolver:
 
     def exact_means(self, shape: Shape, index: np.ndarray) -> np.ndarray:
         """The mean of the source over chosen texels of `shape`, (m, 3), in float64 and in another form."""
+        if shape.octahedral:
+            return octahedral_means(self.environment, shape, index, POINTS[1]) * self.scale
         return self.overlaps.exact(shape, index)
 
     def means(self, shape: Shape) -> np.ndarray:
-        """The mean source radiance over each texel of `shape`, (dims, 3) float32, by exact overlaps."""
+        """The mean source radiance over each texel of `shape`, (dims, 3) float32, by exact overlaps; of octahedral maps
+        by points, whose error the certificate finds."""
+        if shape.octahedral:
+            index = np.arange(shape.count)
+            means = octahedral_means(self.environment, shape, index, POINTS[0]) * self.scale
+            return means.astype(np.float32).reshape(*shape.dims, 3)
         return self.overlaps.level(shape)
 
     # ------------------------------------------------------------------------------------------- statement

@@ -24,7 +24,7 @@ from whitefurnace.catalogue.rule import gauss
 from whitefurnace.cells import evaluate
 from whitefurnace.derived import finest
 from whitefurnace.device import Device
-from whitefurnace.recipe import Chain, roughness_of_lod
+from whitefurnace.recipe import Chain
 
 DISCS = (0.03, 0.1, 0.3, 0.6, 1.0, 1.4)
 """ρ in radians, from a sun's glare to half the sky."""
@@ -62,12 +62,13 @@ def read_mixtures(device: Device, recipe: Chain) -> tuple[Mixture | None, ...]:
 
     The NDF's lobes at any roughness come from its entry's reference, a user's from the device.
     """
-    key = repr(sorted(recipe.ndf.canonical().items()))
+    mapping = (recipe.lods, recipe.size) if recipe.lods.lod else ()
+    key = repr((sorted(recipe.ndf.canonical().items()), mapping))
     return _cached(_Lobes(device, recipe, key), len(recipe.levels))
 
 
 class _Lobes:
-    """What a chain's NDF does at an angle, hashed by the NDF's canonical form."""
+    """What a chain's NDF does at an angle, hashed by the NDF's canonical form and the chain's mapping."""
 
     def __init__(self, device: Device, recipe: Chain, key: str) -> None:
         self.device, self.recipe, self.key = device, recipe, key
@@ -124,7 +125,7 @@ def _within(radius: float, seen: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
-    """The mixtures of `levels` levels of the default mapping.
+    """The mixtures of `levels` levels of the chain's mapping.
 
     Minimises the sum over scenes of the mean over r of the RMS over directions of |read/exact - 1|, each scene
     relative to what the levels' own lobes leave, by iteratively reweighted least squares (the square root of a sum of
@@ -134,7 +135,12 @@ def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
         return (None,) * levels
     pairs = [(k, k + off) for k in range(1, levels) for off in OFFSETS if SHARPEST <= k + off <= levels - 1]
     level, lod = np.array([k for k, _ in pairs]), np.array([x for _, x in pairs])
-    nodes = np.array([roughness_of_lod(x, levels) for x in lod])
+    width = lobes.recipe.size
+
+    def roughness(lods: np.ndarray) -> np.ndarray:
+        return np.array([lobes.recipe.lods.roughness(float(x), levels, width) for x in lods])
+
+    nodes = roughness(lod)
     theta, weight = angles()
     kernels = lobes.at(theta, nodes)
     ring = 2 * math.pi * np.sin(theta) * weight
@@ -142,8 +148,8 @@ def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
     # Scored r: midpoints in lod, in each segment.
     per = min(max(TOGETHER // (levels - 1), FEWEST), MOST)
     steps = (np.arange(per * (levels - 1)) + 0.5) / per
-    scored = np.array([roughness_of_lod(x, levels) for x in steps])
-    ends = np.array([roughness_of_lod(x, levels) for x in np.arange(steps.size + 1) / per])
+    scored = roughness(steps)
+    ends = roughness(np.arange(steps.size + 1) / per)
     share = np.diff(ends)
     exact = lobes.at(theta, scored) * ring
     exact /= exact.sum(1)[:, None]

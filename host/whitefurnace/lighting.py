@@ -24,7 +24,7 @@ from whitefurnace.plan import LevelPlan
 from whitefurnace.recipe import CERTIFIED, IRRADIANCE_SIZE, Chain, chain, samples_of, tolerance_of
 from whitefurnace.run import Integrated
 from whitefurnace.samples import Sampler
-from whitefurnace.sphere import Shape, source_solid_angles
+from whitefurnace.sphere import POINTS, Shape, source_solid_angles
 
 
 @dataclass(frozen=True)
@@ -85,8 +85,8 @@ class Job:
     shape: Shape
 
 
-def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) -> list[Job]:
-    """The jobs of a specular chain, as cubes, or as lat-longs of twice a face's height."""
+def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False, octahedral: bool = False) -> list[Job]:
+    """The jobs of a specular chain, as cubes, as lat-longs of twice a face's height, or as octahedral maps."""
     jobs = []
     planned = planning.plan_chain(recipe, convolver.texel, convolver.share, convolver.texels.centred)
     mixtures = read_mixtures(convolver.device, recipe) if recipe.fit else [None] * len(planned)
@@ -100,7 +100,7 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False) ->
             grid = planning.grid_size(lobe.alpha, recipe.tolerance, max(lobe.horizon, lobe.alpha))
             level = replace(level, grid=level.grid and max(level.grid, grid), cuts=max(level.cuts, planning.cuts_for(
                 convolver.texel, lobe.alpha, recipe.tolerance, convolver.share, convolver.texels.centred)))
-        jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size)))
+        jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size, octahedral=octahedral)))
     return jobs
 
 
@@ -160,7 +160,8 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float, *, cer
                 break
             with clock("certificate"):
                 level = _stated(convolver, job, texels, samples[k], references[k], doubts[k])
-            if level.error <= tolerance or job.plan.samples:
+            # Points of an octahedral texel are as many as they are.
+            if level.error <= tolerance or job.plan.samples or (job.shape.octahedral and job.lobe is None):
                 break
             missed = level.error / tolerance  # NaN too
             finer = planning.refined(job.plan, missed, job.lobe.horizon) if job.lobe else None
@@ -182,6 +183,9 @@ def _make(convolver: Convolver, job: Job, tolerance: float, share: tuple[float, 
           sampler: Sampler | None = None) -> np.ndarray:
     if job.lobe is None:
         return convolver.means(job.shape)
+    if job.shape.octahedral:  # has no orbits of the cube's group
+        values = convolver.on_grid(job.lobe, job.shape.directions(), job.plan.grid, tolerance)
+        return values.astype(np.float32).reshape(*job.shape.dims, 3)
     if sampler and job.plan.samples:
         return sampler.level(job.lobe, job.shape, job.plan.samples, share)
     return convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance, share)
@@ -301,7 +305,7 @@ def _stated(convolver: Convolver, job: Job, texels: np.ndarray, sample: tuple[np
 
 
 def _level(convolver: Convolver, job: Job, texels: np.ndarray, stated: tuple[float, float, float]) -> Level:
-    method, pairs = "texel-mean", 0
+    method, pairs = f"points-{POINTS[0][0]}" if job.shape.octahedral else "texel-mean", 0
     if job.plan.samples:
         method, pairs = f"samples-{job.plan.samples}", job.shape.count * job.plan.samples
     elif job.lobe:
@@ -313,34 +317,53 @@ def _level(convolver: Convolver, job: Job, texels: np.ndarray, stated: tuple[flo
 
 
 @dataclass(frozen=True)
-class Lighting:
-    """Everything of one environment: levels as cubes and (where asked for) as lat-longs, irradiance, SH."""
+class Want:
+    """A chain of a bake: how many of its first levels as cubes, lat-longs and octahedral maps; None: all."""
+
+    recipe: Chain
+    cubes: int | None = None
+    latlongs: int | None = 0
+    octahedral: int | None = 0
+
+
+@dataclass(frozen=True)
+class Filtered:
+    """The levels of a chain that were wanted, and what of the energy each cube keeps, relative to the source."""
 
     levels: tuple[Level, ...]
     latlongs: tuple[Level, ...]
-    irradiance: Level
-    sh: np.ndarray
-    sh_error: float
     energy_kept: tuple[float, ...]
     coverage: tuple[Level, ...]
     latlong_coverage: tuple[Level, ...]
+    octahedral: tuple[Level, ...] = ()
+    octahedral_coverage: tuple[Level, ...] = ()
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Everything of one environment: its chains, in the order they were wanted, irradiance, SH."""
+
+    chains: tuple[Filtered, ...]
+    irradiance: Level
+    sh: np.ndarray
+    sh_error: float
     seconds: float
 
 
-def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = False, seed: str = "",
+def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str = "",
           progress: Progress | None = None) -> Lighting:
-    """The whole of an environment under one recipe, sharing grids and certificates. Raises CheckError where a
-    level cannot reach the tolerance, DeviceError where the device fails."""
+    """The whole of an environment under chains of one tolerance, sharing grids, certificates and equal levels. Raises
+    CheckError where a level cannot reach the tolerance, DeviceError where the device fails."""
     begin = time.perf_counter()
+    recipe = wants[0].recipe
     convolver = Convolver(device, env, precision=planning.precision_for(recipe.tolerance), seed=seed,
                           progress=progress)
-    jobs = chain_jobs(convolver, recipe)
-    wide = chain_jobs(convolver, recipe, latlong=True) if latlong else []
-    everything = [*jobs, *wide, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance, recipe.samples)]
+    jobs, places = _distinct(convolver, wants)
+    everything = [*jobs, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance, recipe.samples)]
     levels = run_jobs(convolver, everything, recipe.tolerance, certify=recipe.certify)
     sh, sh_error = convolver.harmonics()
-    kept = tuple(job.shape.mean(level.texels) / convolver.mean - 1 if convolver.mean > 0 else 0.0
-                 for job, level in zip(jobs, levels[:len(jobs)], strict=True))
+    kept = [job.shape.mean(level.texels) / convolver.mean - 1 if convolver.mean > 0 else 0.0
+            for job, level in zip(jobs, levels[:-1], strict=True)]
     coverage: list[Level] = []
     if env.coverage is not None:
         # Coverage is light of one channel: the same chain, the same statement.
@@ -348,12 +371,36 @@ def light(device: Device, env: Environment, recipe: Chain, *, latlong: bool = Fa
         share = float(np.average(env.coverage, weights=source_solid_angles(env)))
         as_light = replace(env, texels=grey, coverage=None, statistics={"mean": [share] * 3})
         convolver = Convolver(device, as_light, precision=convolver.precision, seed=seed, progress=progress)
-        jobs = chain_jobs(convolver, recipe)
-        wide = chain_jobs(convolver, recipe, latlong=True) if latlong else []
-        coverage = run_jobs(convolver, [*jobs, *wide], recipe.tolerance, certify=recipe.certify)
-    n = len(jobs)
-    return Lighting(tuple(levels[:n]), tuple(levels[n:-1]), levels[-1], sh, sh_error, kept, tuple(coverage[:n]),
-                    tuple(coverage[n:]), time.perf_counter() - begin)
+        jobs, _ = _distinct(convolver, wants)
+        coverage = run_jobs(convolver, jobs, recipe.tolerance, certify=recipe.certify)
+    chains = []
+    for cubes, wide, square in places:
+        covered = [tuple(coverage[k] for k in some) if coverage else () for some in (cubes, wide, square)]
+        chains.append(Filtered(tuple(levels[k] for k in cubes), tuple(levels[k] for k in wide),
+                               tuple(kept[k] for k in cubes), covered[0], covered[1],
+                               tuple(levels[k] for k in square), covered[2]))
+    return Lighting(tuple(chains), levels[-1], sh, sh_error, time.perf_counter() - begin)
+
+
+def _distinct(convolver: Convolver, wants: Sequence[Want]) -> tuple[list[Job], list[tuple[list[int], ...]]]:
+    """The jobs of all chains, each once, and for each chain the places of its cubes, lat-longs and octahedral maps."""
+    jobs: list[Job] = []
+    known: dict[Any, int] = {}
+    places = []
+    for want in wants:
+        placed: tuple[list[int], ...] = ([], [], [])
+        for kind, count in enumerate((want.cubes, want.latlongs, want.octahedral)):
+            if count == 0:
+                continue
+            for job in chain_jobs(convolver, want.recipe, latlong=kind == 1, octahedral=kind == 2)[:count]:
+                lobe = job.lobe and tuple((entry.name, entry.text, *rest) for entry, *rest in job.lobe.summands)
+                key = (lobe, job.shape, job.plan.samples)
+                if key not in known:
+                    known[key] = len(jobs)
+                    jobs.append(job)
+                placed[kind].append(known[key])
+        places.append(placed)
+    return jobs, places
 
 
 def prefilter(source: Any, *, size: int = 256, min_size: int | None = None, ndf: str | Model = "ggx",
@@ -415,4 +462,4 @@ def _device(device: Device | str | None) -> Device:
     return device if isinstance(device, Device) else choose_device(device)
 
 
-__all__ = ["Certified", "Lighting", "Prefiltered", "harmonics", "irradiance", "light", "prefilter"]
+__all__ = ["Certified", "Filtered", "Lighting", "Prefiltered", "Want", "harmonics", "irradiance", "light", "prefilter"]

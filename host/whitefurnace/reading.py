@@ -21,8 +21,8 @@ from whitefurnace.environments import Environment, cube_solid_angles
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
 from whitefurnace.fitting import Mixture, read_mixtures
 from whitefurnace.lobes import Lobe, mixture_lobe, ndf_lobe
-from whitefurnace.recipe import LEVELS_RANGE, Chain, lod_of_roughness
-from whitefurnace.sphere import AXIS, DOWN, RIGHT, Shape, cube_directions
+from whitefurnace.recipe import LEVELS_RANGE, Chain
+from whitefurnace.sphere import Shape, cube_directions, face_coordinates, radiance_at
 
 DIRECTIONS = 256
 """Random directions, the same for every environment. From one set of them to another the mean over r of a studio's
@@ -99,14 +99,6 @@ def stored(values: np.ndarray, format: str) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- reads
 
 
-def face_coordinates(d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Face and its coordinates (s, t) in [-1, 1] of directions (3, m): the inverse of sphere.cube_directions."""
-    axis = np.abs(d).argmax(0)
-    face = 2 * axis + (np.take_along_axis(d, axis[None], 0)[0] < 0)
-    along = (AXIS[:, face] * d).sum(0)
-    return face, (RIGHT[:, face] * d).sum(0) / along, (DOWN[:, face] * d).sum(0) / along
-
-
 def taps(size: int, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices (4, m) and weights (4, m) of a seamless bilinear read of a cube of `size` in directions (3, m).
 
@@ -143,10 +135,10 @@ def bilinear(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
     return np.einsum("km,kmc->mc", weights, texels.reshape(-1, 3)[index].astype(np.float64))
 
 
-def hats(roughness: np.ndarray, levels: int) -> np.ndarray:
-    """(r, levels): the weight of each level in a read at roughness r, linear in lod between two."""
-    lod = np.array([lod_of_roughness(float(r), levels) for r in roughness])
-    return np.maximum(1 - np.abs(lod[:, None] - np.arange(levels)), 0)
+def hats(roughness: np.ndarray, recipe: Chain) -> np.ndarray:
+    """(r, levels): the weight of each level of a chain in a read at roughness r, linear in lod between two."""
+    lod = np.array([recipe.lod(float(r)) for r in roughness])
+    return np.maximum(1 - np.abs(lod[:, None] - np.arange(len(recipe.levels))), 0)
 
 
 # ------------------------------------------------------------------------------------------------- references
@@ -243,18 +235,7 @@ class Exact:
 
     def radiance(self, d: np.ndarray) -> np.ndarray:
         """(m, 3): the texel of the environment in each direction, its rotation included."""
-        c, s = math.cos(self.env.rotation), math.sin(self.env.rotation)
-        x, y, z = c * d[0] + s * d[2], d[1], c * d[2] - s * d[0]
-        rows, columns = self.env.texels.shape[-3:-1]
-        if self.env.kind == "latlong":
-            row = np.arccos(np.clip(y, -1, 1)) / math.pi * rows
-            column = (np.arctan2(z, x) / (2 * math.pi) + 0.5) * columns
-            at = np.minimum(row.astype(int), rows - 1) * columns + np.minimum(column.astype(int), columns - 1)
-        else:
-            face, a, b = face_coordinates(np.stack([x, y, z]))
-            column, row = (np.clip(((u + 1) / 2 * rows).astype(int), 0, rows - 1) for u in (a, b))
-            at = (face * rows + row) * rows + column
-        return self.env.texels.reshape(-1, 3)[at].astype(np.float64)
+        return radiance_at(self.env, d)
 
     def means(self, size: int, index: np.ndarray) -> np.ndarray:
         """(m, 3): the exact means over texels of a cube of `size`, by flat index: what level 0 stores."""
@@ -360,14 +341,16 @@ class Reader:
         return [mixture or lobe for mixture, lobe in zip(read_mixtures(self.device, recipe), own, strict=True)]
 
     def as_read(self, recipe: Chain, levels: Sequence[np.ndarray] | None = None,
-                errors: Sequence[float] | None = None, *, format: str = "float32", texels: bool = True) -> AsRead:
+                errors: Sequence[float] | None = None, *, format: str = "float32",
+                kept: Sequence[np.ndarray] | None = None, texels: bool = True) -> AsRead:
         """The error of a chain as it is read.
 
         levels: its baked levels, (6, s, s, 3) each, and `errors` what they state; without them it is that of levels
-        exact in every texel. texels: False leaves out what lies within a level, and costs next to nothing then.
+        exact in every texel. kept: what `format` made of the levels; without it one of FORMATS is applied. texels:
+        False leaves out what lies within a level, and costs next to nothing then.
         """
         mixtures = self.mixtures(recipe)
-        weights = hats(scored(), len(mixtures))
+        weights = hats(scored(), recipe)
         nodes = sorted({r for mixture in mixtures for _, r in mixture})
         values = dict(zip(nodes, self.at_directions.at(nodes), strict=True))
         there = np.stack([sum(w * values[r] for w, r in mixture) for mixture in mixtures])  # (levels, m, 3)
@@ -377,12 +360,15 @@ class Reader:
             made = (self._texels(recipe, mixtures, tapped) if levels is None else
                     [level.reshape(-1, 3)[index].astype(np.float64)
                      for level, (index, _) in zip(levels, tapped, strict=True)])
-            read, kept = (np.stack([np.einsum("km,kmc->mc", w, part)
-                                    for part, (_, w) in zip(some, tapped, strict=True)])
-                          for some in (made, [stored(part, format) for part in made]))
+            held = ([stored(part, format) for part in made] if kept is None else
+                    [level.reshape(-1, 3)[index].astype(np.float64)
+                     for level, (index, _) in zip(kept, tapped, strict=True)])
+            read, shown = (np.stack([np.einsum("km,kmc->mc", w, part)
+                                     for part, (_, w) in zip(some, tapped, strict=True)])
+                           for some in (made, held))
             parts["texels"] = np.tensordot(weights, read - there, 1)
-            parts["format"] = np.tensordot(weights, kept - read, 1)
-            parts["all"] = np.tensordot(weights, kept, 1) - self.reference
+            parts["format"] = np.tensordot(weights, shown - read, 1)
+            parts["all"] = np.tensordot(weights, shown, 1) - self.reference
         off = {part: np.stack([texel_errors(ref + more, ref, self.exact.mean)
                                   for ref, more in zip(self.reference, difference, strict=True)])
                   for part, difference in parts.items()}
@@ -416,8 +402,8 @@ def alternatives(recipe: Chain) -> list[Chain]:
     return found
 
 
-def compared(device: Device, env: Environment, recipe: Chain) -> list[AsRead]:
-    """`alternatives` as they are read, the levels exact."""
-    choices = alternatives(recipe)
+def compared(device: Device, env: Environment, recipe: Chain, *, alone: bool = False) -> list[AsRead]:
+    """`alternatives` as they are read, the levels exact; `alone`: the plan only, where an engine allows no other."""
+    choices = [recipe] if alone or recipe.levels[-1][1] > 1 else alternatives(recipe)
     reader = Reader(device, env, *choices)
     return [reader.as_read(choice, texels=len(choice.levels) == len(recipe.levels)) for choice in choices]

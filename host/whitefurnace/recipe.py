@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ import numpy as np
 from whitefurnace.catalogue import Model, model
 from whitefurnace.catalogue.user import user_model
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
+from whitefurnace.expression import Expression
 
 QUALITIES = {"draft": 1e-2, "normal": 1e-3, "reference": 2e-5}
 SIZE_RANGE = (1, 2048)
@@ -148,6 +150,71 @@ def lod_of_roughness(roughness: float, levels: int) -> float:
     return (levels - 1) * roughness * (2 - roughness)
 
 
+LOD_NAMES = ("r", "alpha", "max_lod", "width")
+"""What an engine's lod is a formula of: perceptual roughness, its square, levels - 1, and texels an edge of level 0."""
+
+ROUGHEST = 4.0
+"""No level is rougher: α = 16. Babylon's last mips have α = 1.4 and 3.4."""
+
+
+@dataclass(frozen=True)
+class Lods:
+    """The levels an engine reads: its `lod(r)`, None for the default; `follow`: levels past r = 1 hold a lobe of that
+    α, as the engine's own filter would make; otherwise they hold that of r = 1."""
+
+    lod: Expression | None = None
+    follow: bool = False
+
+    def at(self, roughness: float, levels: int, width: int) -> float:
+        """The lod in [0, levels - 1] that is read for a roughness."""
+        if self.lod is None or levels == 1:
+            return lod_of_roughness(roughness, levels) if levels > 1 else 0.0
+        return min(max(self._lod(roughness, levels, width), 0.0), levels - 1.0)
+
+    def roughness(self, lod: float, levels: int, width: int) -> float:
+        """Its inverse, 0 for lod 0: engines hold the image itself there. Raises UsageError where lod(r) falls."""
+        if self.lod is None or levels == 1:
+            return roughness_of_lod(lod, levels)
+        if lod <= 0:
+            return 0.0
+        low, high = 0.0, 1.0
+        end = _checked_end(self.lod, levels, width)
+        if abs(end - lod) <= 1e-9:  # lod(r) may be flat there
+            return 1.0
+        if end < lod:  # past r = 1
+            if not self.follow:
+                return 1.0
+            while high < ROUGHEST and self._lod(high, levels, width) < lod:
+                low, high = high, high + 1 / 64
+            if self._lod(high, levels, width) < lod:  # never read
+                return 1.0
+        for _ in range(60):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self._lod(middle, levels, width) < lod else (low, middle)
+        # To 12 digits, so that a level at r = 1 is exactly that.
+        return round(high, 12)
+
+    def _lod(self, roughness: float, levels: int, width: int) -> float:
+        assert self.lod is not None
+        return float(self.lod(r=roughness, alpha=roughness * roughness, max_lod=levels - 1, width=width))
+
+
+@lru_cache(maxsize=64)
+def _checked_end(lod: Expression, levels: int, width: int) -> float:
+    """lod(1). Raises UsageError for what is no number in (0, 1] or does not grow there."""
+    r = np.arange(1, 513) / 512
+    values = np.broadcast_to(lod(r=r, alpha=r * r, max_lod=levels - 1, width=width), r.shape)
+    what = f"{lod.where}: {lod.text!r} over {levels} levels of {width}²"
+    if not np.all(values < math.inf):  # NaN too
+        raise UsageError(f"{what} is {values[~(values < math.inf)][0]} at r = {r[~(values < math.inf)][0]:g}")
+    with np.errstate(invalid="ignore"):
+        if not np.all(values[1:] >= values[:-1]):
+            raise UsageError(f"{what} falls where r grows, near r = {r[1:][~(values[1:] >= values[:-1])][0]:g}")
+    if values[-1] <= 0:
+        raise UsageError(f"{what} is {values[-1]:g} at r = 1: every roughness would read level 0")
+    return float(values[-1])
+
+
 CERTIFIED = 299
 """Uniform texels of a certificate: the largest of 299 errors bounds the 99th percentile at 95 % confidence, since
 .99^299 = .0495 (order statistic)."""
@@ -157,7 +224,7 @@ CERTIFY_RANGE = (CERTIFIED, 1 << 20)
 
 @dataclass(frozen=True)
 class Chain:
-    """A specular chain: sizes halve from `size` to `min_size`, roughness follows the default mapping.
+    """A specular chain: sizes halve from `size` to `min_size`, roughness follows `lods`.
 
     `count` levels, None for those that halving gives; sizes past `min_size` stay there. `fit` "read" bakes mixtures
     of lobes that read best between levels (fitting.py), None each level's own lobe. `samples` is how many a texel of
@@ -172,19 +239,27 @@ class Chain:
     fit: str | None = None
     samples: int | None = None
     certify: int = CERTIFIED
+    lods: Lods = Lods()
 
-    @property
+    @cached_property
     def levels(self) -> tuple[tuple[int, float], ...]:
         """(size, perceptual roughness) of each level."""
         n = self.count or int(math.log2(self.size // self.min_size)) + 1
-        return tuple((max(self.size >> k, self.min_size), roughness_of_level(k, n)) for k in range(n))
+        return tuple((max(self.size >> k, self.min_size), self.lods.roughness(k, n, self.size)) for k in range(n))
+
+    def lod(self, roughness: float) -> float:
+        """The lod that is read for a roughness."""
+        return self.lods.at(roughness, len(self.levels), self.size)
 
     def parameters(self, roughness: float) -> dict[str, float]:
         """The NDF's parameters at a perceptual roughness."""
-        assert self.ndf.model.from_roughness is not None
+        entry = self.ndf.model
+        assert entry.from_roughness is not None
         given = {name: value for name, value in self.ndf.given.items() if not isinstance(value, tuple)}
         defaults = {p.name: p.default for p in self.ndf.model.parameters if p.default is not None}
-        return {**defaults, **self.ndf.model.from_roughness(roughness), **given}
+        if roughness > 1 and entry.past_one:
+            return {**defaults, **entry.past_one(roughness), **given}
+        return {**defaults, **entry.from_roughness(min(roughness, 1.0)), **given}
 
     def canonical(self) -> dict[str, Any]:
         return {"ndf": self.ndf.canonical(), "size": self.size, "min_size": self.min_size,
@@ -192,10 +267,10 @@ class Chain:
                 "roughness": [r for _, r in self.levels], "fit": self.fit, "certify": self.certify}
 
 
-def _smallest(size: int, min_size: int | None, levels: int | None) -> int:
-    """Face edge of the last level: as given, what `levels` halvings leave, or MIN_SIZE. Raises UsageError."""
+def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = MIN_SIZE) -> int:
+    """Face edge of the last level: as given, what `levels` halvings leave, or the usual one. Raises UsageError."""
     if levels is None:
-        return MIN_SIZE if min_size is None else min_size
+        return min(usual, size) if min_size is None and usual != MIN_SIZE else usual if min_size is None else min_size
     low, high = LEVELS_RANGE
     if not (is_number(levels) and low <= levels <= high and levels == int(levels)):
         raise UsageError(f"levels {levels!r} is not a whole number in [{low}, {high}]")
@@ -213,9 +288,11 @@ def _smallest(size: int, min_size: int | None, levels: int | None) -> int:
 
 def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int | None = None, tolerance: float | None = None,
           quality: str | None = None, levels: int | None = None, fit: str | None = None,
-          samples: int | None = None, certify: int = CERTIFIED) -> Chain:
+          samples: int | None = None, certify: int = CERTIFIED, lods: Lods | None = None,
+          usual_min: int = MIN_SIZE) -> Chain:
     """A validated specular chain.
 
+    lods: the mapping of an engine, Filament's and three.js's without; `usual_min`: the last size where none is given.
     `min_size` is 16, or with `levels` what as many halvings leave; with both, sizes halve to `min_size` and stay.
     Raises UsageError for a size that is no power of two, a `min_size` over `size`, levels that do not fit, a bad
     tolerance or name, samples out of range or beside one of these; UnsupportedError for an NDF that cannot be
@@ -242,7 +319,7 @@ def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int | None = N
         raise UsageError(f"unknown fit {fit!r}{nearest(fit, FITS)}")
     size = _power_of_two(size, "size")
     given = None if min_size is None else _power_of_two(min_size, "min-size")
-    smallest = _smallest(size, given, levels)
+    smallest = _smallest(size, given, levels, usual_min)
     if smallest > size:
         raise UsageError(f"min-size {smallest} is larger than size {size}")
     count = samples_of(samples, tolerance, quality)
@@ -250,5 +327,9 @@ def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int | None = N
     if certify != 0 and not (is_number(certify) and low <= certify <= high and certify == int(certify)):
         raise UsageError(f"certify {certify!r} is not a whole number in [{low}, {high}]: {low} texels are the fewest "
                          "that bound 99 % of a level at 95 % confidence")
-    return Chain(choice, size, smallest, tolerance_of(tolerance, quality), None if levels is None else int(levels), fit,
-                 count, int(certify))
+    made = Chain(choice, size, smallest, tolerance_of(tolerance, quality), None if levels is None else int(levels), fit,
+                 count, int(certify), lods or Lods())
+    if fit and made.levels[-1][1] > 1:
+        raise UnsupportedError(f"fit {fit!r} goes up to r = 1; the last level of this mapping is at "
+                               f"r = {made.levels[-1][1]:.3g}")
+    return made
