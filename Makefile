@@ -2,6 +2,7 @@
 #
 #   make [bake] [ENV=image] [OUT=folder] [ARGS='--size 512 ...']     bakes the demo or your environment
 #   make test | test-all [ARGS='-k name']                            test-all: those that take minutes too
+#   make test-engines                                                three.js, Babylon.js, Filament in Chromium
 #   make bench | lint | devices | clean
 
 # `=`, not `?=`: a variable ENV of the shell means something else.
@@ -21,7 +22,7 @@ SOURCES := setup.cfg pyproject.toml LICENSE $(wildcard README.md) \
 .ONESHELL:
 .SHELLFLAGS = -ec
 .DELETE_ON_ERROR:
-.PHONY: bake test test-all bench lint devices clean
+.PHONY: bake test test-all test-engines bench lint devices clean
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 # What is tested is the wheel, whatever the caller's shell has on its path.
 unexport PYTHONPATH
@@ -34,6 +35,11 @@ test: $(VENV)/device.done $(VENV)/test.done
 
 test-all: $(VENV)/device.done $(VENV)/test.done
 	@$(BIN)/pytest $(ARGS) tests
+
+# What they need and cannot be had is a reason to skip them, told at the end.
+test-engines: $(VENV)/device.done $(VENV)/test.done $(VENV)/engines/node_modules
+	@export WHITEFURNACE_NODE_MODULES="$${WHITEFURNACE_NODE_MODULES:-$(CURDIR)/$(VENV)/engines/node_modules}"
+	$(BIN)/pytest -m engines $(ARGS) tests/test_engines.py
 
 bench: $(VENV)/device.done $(VENV)/test.done
 	@for file in benchmarks/*.py; do $(BIN)/python "$$file" $(ARGS); done
@@ -69,6 +75,26 @@ $(VENV)/installed.done: $(VENV)/created.done $(SOURCES)
 $(VENV)/test.done $(VENV)/lint.done: $(VENV)/%.done: setup.cfg | $(VENV)/installed.done
 	@$(BIN)/pip install --quiet "$(WHEEL)[$*]"
 	touch $@
+
+# The browser from Debian, where this may install; the engines from npm.
+$(VENV)/engines/node_modules: tests/engines/package.json | $(VENV)/installed.done
+	@if ! { command -v chromium || command -v chromium-browser || command -v google-chrome; } >/dev/null &&
+		[ -z "$$WHITEFURNACE_CHROMIUM" ] && [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+		echo "Installing Chromium from Debian."
+		export DEBIAN_FRONTEND=noninteractive
+		timeout 120 apt-get -qq update || true
+		timeout 300 apt-get -qq install --yes --no-install-recommends chromium >/dev/null || true
+	fi
+	if [ -n "$$WHITEFURNACE_NODE_MODULES" ] || ! command -v npm >/dev/null; then exit 0; fi
+	echo "Installing the engines from npm."
+	mkdir -p $(VENV)/engines
+	cp tests/engines/package.json $(VENV)/engines
+	if timeout 300 npm install --ignore-scripts --no-audit --no-fund --silent --prefix $(VENV)/engines; then
+		touch $@
+	else
+		echo "npm could not."
+		rm -rf $@
+	fi
 
 # A device that is listed is not one that works, so each source of one is tried and asked; once.
 $(VENV)/device.done: $(VENV)/installed.done

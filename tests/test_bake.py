@@ -914,13 +914,14 @@ def test_a_tolerance_out_of_reach_fails_the_check_and_writes_nothing(tmp_path, s
     assert "1e-05" in shell.sentence() and tree(tmp_path / "out") == {}
 
 
-@pytest.mark.parametrize("options", [{}, {"samples": 16}, {"size": 64, "min_size": 16, "levels": 9}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"samples": 16}, {"size": 64, "min_size": 16, "levels": 9},
+                                     {"for_": "khronos,filament,babylon", "min_size": None, "size": 16}], ids=str)
 def test_every_kernel_of_a_bake_is_in_its_key(tmp_path, device, monkeypatch, options):
     """A bake is skipped on the word of its key: whatever text made it must be part of that."""
     built, build = set(), Device.build
     monkeypatch.setattr(Device, "build", lambda self, text, *rest: (built.add(text), build(self, text, *rest))[1])
     monkeypatch.setattr(baking, "_table", lambda *_: dfg(baking.DFG_SIZE, device=device))
     bake(noise(), tmp_path / "out", device=device, **{**SIZES, **options})
-    known = baking._kernel_digests("latlong", baking._Held.of(chain().ndf))
+    known = baking._kernel_digests("latlong", baking._Held.of(chain().ndf), "for_" in options)
     unknown = [text[:60] for text in built if hashlib.sha256(text.encode()).hexdigest() not in known]
     assert built and not unknown

@@ -12,7 +12,8 @@ import pytest
 
 from reference import cube_directions
 from whitefurnace import bake, dfg, harmonic, octamap
-from whitefurnace.engines import ENGINES, FORMATS, axes_matrix, engines, user_engine
+from whitefurnace.cli import main
+from whitefurnace.engines import ENGINES, FORMATS, as_text, axes_matrix, engines, user_engine
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.expression import LANGUAGES, Expression, table_text
 from whitefurnace.files import read_env, read_gltf_lights, read_image, read_texture
@@ -215,8 +216,8 @@ def test_presets_share_the_levels_they_have_in_common(baked):
     rows = {(row["size"], row["roughness"]): row["for"] for row in made.levels}
     assert len(rows) == len(made.levels), "a level was made twice"
     assert {"raw", "filament", "bevy", "gltf", "unity"} <= set(rows[64, 0.0])
-    assert {"raw", "filament"} <= set(rows[32, chain(size=64).levels[1][1]])
-    assert {"gltf", "bevy"} <= set(rows[32, 0.5])
+    assert {"three", "filament"} <= set(rows[32, chain(size=64, min_size=8).levels[1][1]])
+    assert {"gltf", "raw"} <= set(rows[16, 1.0])
 
 
 def test_harmonics_of_engines_are_theirs(baked):
@@ -261,8 +262,9 @@ def test_charlie_and_coverage(tmp_path, device):
 
 def test_files_are_no_larger_than_they_need_be(tmp_path, device):
     bake(coded(256), tmp_path, for_="filament,bevy,babylon,unity,three", size=128, device=device)
-    texels = 6 * sum(s * s for s in (128, 64, 32, 16))
+    texels = 6 * sum(s * s for s in (128, 64, 32, 16, 8))
     header = 1024  # KTX 1's, its keys and the harmonics
+    assert 4 * texels == 523_776
     assert (tmp_path / "filament" / "array_ibl.ktx").stat().st_size <= 4 * texels + header
     assert (tmp_path / "unity" / "array_cube.dds").stat().st_size == 148 + 8 * 6 * sum(4**k for k in range(1, 8))
     # Zstandard and PNG find something even in a gradient, in which no two texels are alike.
@@ -428,6 +430,29 @@ def test_octahedral_maps(tmp_path, device):
         assert np.abs(read - (1 + c * d.T) / 2).max() < 0.02 + 1 / s, s
     with pytest.raises(UnsupportedError, match="octahedral"):
         bake(coded(8), tmp_path / "x", for_=str(tmp_path / "square.toml"), samples=16, device=device)
+
+
+@pytest.mark.parametrize("name", LOADED)
+def test_a_preset_as_a_file_is_the_preset(tmp_path, name):
+    path = tmp_path / "copy.toml"
+    path.write_text(as_text(ENGINES[name]))
+    own = {**ENGINES[name].data(), "name": "copy", "proven": False, "facts": "given in copy.toml"}
+    assert user_engine(path).data() == own
+
+
+def test_engines_are_listed(capsys):
+    def shell(*arguments: str) -> tuple[int, str]:
+        with pytest.raises(SystemExit) as done:
+            main(["engines", *arguments])
+        out, err = capsys.readouterr()
+        return done.value.code, out + err
+
+    code, text = shell()
+    assert code == 0 and all(name in text for name in ENGINES)
+    code, text = shell("filament")
+    assert code == 0 and "STEM_ibl.ktx: specular, b10g11r11" in text and "alpha * alpha" in text
+    assert [json.loads(line)["name"] for line in shell("--json")[1].splitlines()] == list(ENGINES)
+    assert shell("raw", "--toml")[0] == 1 and shell("--toml")[0] == 1 and "did you mean" in shell("bevi")[1]
 
 
 def test_engines_that_are_not_there(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from whitefurnace.engines import user_engine
 from whitefurnace.environments import LAYOUTS
 from whitefurnace.files import write_exr
 
@@ -37,6 +38,7 @@ def folder(tmp_path_factory) -> Path:
     rng = np.random.default_rng(7)
     for name in ("studio.hdr", "day.exr", "night.exr", "forest_1k.exr"):
         write_exr(where / name, rng.random((16, 32, 3), np.float32))
+    (where / "my_engine.toml").write_text(blocks("toml")[0])
     for block in blocks("c"):
         name = re.search(r"(?:ndf|brdf)_(\w+)_[Df]\(", block)
         assert name, block
@@ -51,7 +53,10 @@ def test_there_are_commands_to_test():
 @pytest.mark.parametrize("command", commands())
 def test_a_command_of_the_readme_runs(command, folder):
     arguments = shlex.split(command)[1:]
-    if {"--size", "--tolerance"} & set(arguments):  # long bakes: planned only
+    if arguments[0] == "render":  # of a small bake, its manifest DIR/NAME.json
+        manifest, engine = Path(arguments[1]), arguments[arguments.index("--for") + 1]
+        run("bake", manifest.stem, "-o", str(manifest.parent), "--for", engine, "--size", "32", cwd=folder)
+    elif {"--size", "--tolerance"} & set(arguments):  # long bakes: planned only
         arguments.append("--dry-run")
     done = run(*arguments, cwd=folder)
     assert done.returncode == 0, done.stderr
@@ -70,6 +75,19 @@ def test_the_table_of_models_is_what_the_program_lists():
     assert written.strip("\n") == listed.stdout.strip("\n")
 
 
+def test_the_table_of_engines_is_what_the_program_lists():
+    written = README.partition("<!-- engines:")[2].partition("```\n")[2].partition("```")[0]
+    assert written.strip("\n") == run("engines").stdout.strip("\n")
+
+
+def test_the_engine_of_the_readme_is_one(folder):
+    (text,) = blocks("toml")[:1]
+    (folder / "my_engine.toml").write_text(text)
+    assert user_engine(folder / "my_engine.toml").file
+    done = run("bake", "forest_1k.exr", "-o", "mine", "--for", "my_engine.toml", "--dry-run", cwd=folder)
+    assert done.returncode == 0, done.stderr
+
+
 def test_the_table_of_layouts_names_every_layout():
     table = README.partition("| layout | aspect |")[2].partition("\n\n")[0]
     for layout in LAYOUTS:
@@ -77,7 +95,8 @@ def test_the_table_of_layouts_names_every_layout():
 
 
 def test_the_options_of_the_readme_exist():
-    told = "".join(run(command, "--help").stdout for command in ("bake", "lut", "verify", "bench", "models", "devices"))
+    told = "".join(run(command, "--help").stdout for command in ("bake", "lut", "verify", "bench", "models", "devices",
+                                                                   "inspect", "compare", "render", "engines"))
     for option in set(re.findall(r"`(--[a-z-]+)", README)):
         assert option in told, option
 

@@ -44,8 +44,8 @@ def cli(context: click.Context) -> None:
 @click.option("-o", "--output", metavar="DIR", required=True, type=click.Path(path_type=Path), help="Output folder.")
 @click.option("--for", "for_", metavar="LIST", default="raw", show_default=True,
               help="Who loads it, separated by commas: raw (.npz), exr (strips and lat-longs).")
-@click.option("--size", type=int, default=256, show_default=True, help="Face edge of the first level, a power of two.")
-@click.option("--min-size", type=int, help="Face edge of the last level. [default: 16]")
+@click.option("--size", type=int, help="Face edge of the first level, a power of two. [default: 256]")
+@click.option("--min-size", type=int, help="Face edge of the last level. [default: 16, or what the engine wants]")
 @click.option("--levels", type=int, help="How many levels, down to 1²; those past a --min-size keep that size.")
 @click.option("--fit", metavar="read", help="Levels that read best between them, not each its own lobe.")
 @click.option("--as-read", is_flag=True, help="State what engines will show of them too; --fit and --dry-run do.")
@@ -63,6 +63,9 @@ def cli(context: click.Context) -> None:
               help="What to do with NaN, infinite and negative values.")
 @click.option("--sun", metavar="keep|extract|clamp=X", default="keep", show_default=True,
               help="Take the sun out as a directional light, or leave no texel over X times the mean.")
+@click.option("--sh", metavar="window=auto|none|X", default="window=auto", show_default=True,
+              help="Window of an engine's irradiance harmonics: the least that keeps them from going negative, none, "
+                   "or sinc⁴ with its cutoff at degree X.")
 @click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done and written, and do nothing.")
 @click.option("--force", is_flag=True, help="Bake again, and replace files that are not known to be ours.")
@@ -74,7 +77,7 @@ def bake(environments: tuple[str, ...], output: Path, for_: str, device: str | N
     table, each with its error.
 
     ENV is an image (EXR, HDR, PNG, TIFF, ...) as lat-long, cross or strip, a folder of six faces (px, nx, py, ny,
-    pz, nz), or the word demo for the built-in sky.
+    pz, nz), a texture (.ktx, .ktx2, .dds, .env, .gltf), or the word demo for the built-in sky.
     """
     from whitefurnace import baking, report
 
@@ -114,6 +117,9 @@ Examples:
   whitefurnace lut dfg -o dfg.npy --size 256
   whitefurnace lut dfg -o fitted.npy --size 64 --axis sqrt --fit bilinear
   whitefurnace lut energy -o energy.npy --size 64 --scheme turquin
+  whitefurnace lut ltc -o ltc.npy
+  whitefurnace lut glass -o glass.ktx2 --size 32
+  whitefurnace lut smith -o smith.h --ndf abc:c=1.5
   whitefurnace lut albedo -o gold.exr --fresnel schlick:gold --size 64x32
   whitefurnace lut albedo -o sheen.npy --ndf charlie --axis alpha=.01:1:64:log --tolerance 1e-4
   whitefurnace lut albedo_average -o average.npy --fresnel schlick --axis f0=0:1:32
@@ -136,14 +142,20 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device o
 @cli.command(epilog=EPILOG_LUT)
 @click.argument("kind")
 @click.option("-o", "--output", metavar="FILE", required=True, type=click.Path(path_type=Path),
-              help="The table, .npy or .exr (float32, two axes).")
-@click.option("--size", metavar="N|NxM", default="128", show_default=True, help="Cells along x and y, 1 to 16384.")
+              help="The table: .npy, .exr, .png (of values from 0 to 1), .ktx2, .dds or .h.")
+@click.option("--size", metavar="N|NxM", help="Cells along x and y, 1 to 16384. [default: 128, 64 for ltc]")
 @click.option("--axis", "axes", metavar="NAME=A:B:N[:SCALE]", multiple=True,
-              help="A parameter from A to B in N steps; SCALE: linear, log, centres or sqrt. `sqrt` alone scales NoV.")
+              help="A parameter from A to B in N steps; SCALE: linear, log, centres, sqrt, angle. Alone it scales NoV.")
 @click.option("--set", "fixed", metavar="NAME=VALUE", multiple=True, help="Fix a parameter.")
 @click.option("--fit", metavar="bilinear", help="Texels that read best between them, of two axes; states --as-read.")
 @click.option("--as-read", is_flag=True, help="State the error of reads between texels too, of float16 and r8 as well.")
-@click.option("--scheme", metavar="NAME", help="Of energy: kulla_conty (the default), turquin or fdez_aguera.")
+@click.option("--format", "stored", metavar="NAME",
+              help="Of .ktx2 and .dds: rg16f (the default up to two channels), rgba16f, rgba32f; of .png: r16, r8.")
+@click.option("--for", "for_", metavar="ENGINE", help="Of dfg: the size, axes and form that an engine reads.")
+@click.option("--scheme", metavar="NAME",
+              help="Of dfg: scale_bias (the default), multiscatter; of energy: kulla_conty (the default), turquin, "
+                   "fdez_aguera; of ltc: free (the default), heitz; of "
+                   "glass: entering (the default), leaving; of smith: rational (the default), linear.")
 @click.option("--ndf", metavar="NAME[:p=v,...]", help="Or FILE.clh. [default: ggx, without a --diffuse or --brdf]")
 @click.option("--masking", metavar="NAME", help="[default: smith]")
 @click.option("--fresnel", metavar="NAME[:p=v,...]", help="Or NAME:PRESET, as schlick:gold. [default: one]")
@@ -168,12 +180,15 @@ def lut(kind: str, output: Path, axes: tuple[str, ...], fixed: tuple[str, ...], 
     """Write a table of an integral over a grid of parameters.
 
     KIND is normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance; energy, which is
-    what multiple scattering gives back; sheen, with what it leaves to the layer under it; or fresnel_average.
+    what multiple scattering gives back; sheen, with what it leaves to the layer under it; fresnel_average;
+    glass, what a rough boundary reflects and lets through; smith and norm, coefficients of simpler curves; or
+    ltc, linearly transformed cosines for polygonal lights (ltc_1 and ltc_2 are one each of its two textures).
     """
     from whitefurnace import report, tables
 
     axes = tuple(f"NoV={item}" if item in tables.SCALES else item for item in axes)
-    request = tables.order(kind, output, axes=_named("--axis", axes), parameters=_named("--set", fixed), **options)
+    request = tables.order(kind, output, axes=tables.named("--axis", axes),
+                           parameters=tables.named("--set", fixed), **options)
     with _progress(not (quiet or as_json)) as tell:
         made = tables.make(request, device, dry_run=dry_run, progress=tell)
     for notice in () if quiet else made.notices:
@@ -184,18 +199,111 @@ def lut(kind: str, output: Path, axes: tuple[str, ...], fixed: tuple[str, ...], 
         click.echo(report.table_text(made))
 
 
-def _named(option: str, given: tuple[str, ...]) -> dict[str, str]:
-    """NAME=VALUE options by name."""
-    from whitefurnace.errors import UsageError
+EPILOG_BATCH = """\b
+Examples:
+  whitefurnace batch probes.toml --dry-run
+  whitefurnace batch probes.toml --workers 4
+  whitefurnace batch probes.toml --shard 2/8 --depfile probes.2.d
 
-    found: dict[str, str] = {}
-    for item in given:
-        name, equals, value = item.partition("=")
-        if not (name.isidentifier() and equals and value) or name in found:
-            form = "NAME=A:B:N[:SCALE]" if option == "--axis" else "NAME=VALUE"
-            raise UsageError(f"{option} {item!r}: {name or 'a name'} must be given once, as {form}")
-        found[name] = value
-    return found
+\b
+JOB is a TOML file of tables [[bake]] and [[lut]]. A [[bake]] has `environments`, a list of paths and patterns (* ? [...]
+and **), `output`, a folder, `for`, a list, and the options of `whitefurnace bake` under their names; a [[lut]] has
+`kind`, `output`, a file, and those of `whitefurnace lut`, `axis` and `set` as lists. Paths are relative to JOB.
+All of it is checked before anything runs. What is there and whole is not made again, whoever made it, so a batch that
+was stopped goes on where it was.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input (the job too), 4 device or build, 5 not supported,
+7 a tolerance was missed, 8 part of several failed, 130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_BATCH)
+@click.argument("job", type=click.Path(path_type=Path))
+@click.option("-o", "--output", "root", metavar="DIR", type=click.Path(path_type=Path),
+              help="The folder that all outputs are in and stay in. [default: the folder of JOB]")
+@click.option("--workers", metavar="N", type=int, default=1, show_default=True,
+              help="Processes on this machine, each with its share of the device's cores.")
+@click.option("--scheduler", metavar="tcp://HOST:PORT",
+              help="A Dask cluster, whose workers declare the resource OPENCL and see the same folders.")
+@click.option("--send", is_flag=True, help="Send sources to the cluster by value: workers need not see them.")
+@click.option("--shard", metavar="I/N", help="Every N-th item from the I-th on; the N shards are the whole.")
+@click.option("--depfile", metavar="FILE", type=click.Path(path_type=Path),
+              help="Write what was made, and from what, as Makefile rules.")
+@click.option("--allow-kernels", is_flag=True, help="Let the job name .clh files, whose text the device runs.")
+@click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done and written, and do nothing.")
+@click.option("--force", is_flag=True, help="Make all again, and replace files that are not known to be ours.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
+@click.option("--quiet", is_flag=True, help="Print failures only.")
+def batch(job: Path, root: Path | None, workers: int, scheduler: str | None, send: bool, shard: str | None,
+          depfile: Path | None, allow_kernels: bool, device: str | None, dry_run: bool, force: bool, as_json: bool,
+          quiet: bool) -> None:
+    """Do many bakes and tables of a job file, each once: what is whole already is skipped."""
+    from whitefurnace import batch as batching
+    from whitefurnace import errors, report
+
+    part = report.shard(shard) if shard is not None else None
+    if send and scheduler is None:
+        raise errors.UsageError("--send sends sources to a --scheduler's cluster, and none is given")
+    made = batching.job(job, root=root, allow_kernels=allow_kernels, force=force, device=device, send=send)
+    if part:
+        made = made.shard(*part)
+    tally = report.Tally(len(made.items))
+    results = []
+
+    def tell(result: Any) -> None:
+        tally.add(result)
+        if depfile is not None:
+            results.append(result)
+        if as_json:
+            _json(report.result_row(result))
+        elif not quiet and (line := report.result_text(result)):
+            click.echo(line)
+        for notice in () if quiet else result.notices:
+            _say(f"notice: {result.place}: {notice}")
+        if result.state == "failed":
+            _say(f"error: {result.place}: {result.message}")
+
+    begin = tally.begin
+    try:
+        if dry_run:
+            for result in made.predicted():
+                tell(result)
+        else:
+            with _batch_progress(tally, not (quiet or as_json)) as show:
+                batching.run(made, workers=workers, scheduler=scheduler,
+                             on_result=lambda result: (tell(result), show())[1],
+                             on_notice=None if quiet else lambda text: _say(f"notice: {text}"))
+        if depfile is not None and not dry_run:
+            batching.depfile(made, results, depfile)
+    finally:
+        if as_json:
+            _json(tally.row(begin))
+        else:
+            for line in tally.failures():
+                _say(line)
+            if not quiet:
+                click.echo(tally.text())
+    if tally.failed:
+        codes = {result.exit_code for result in tally.failed}
+        kind = errors.of_code(codes.pop()) if len(codes) == 1 and len(tally.failed) == tally.total else None
+        raise (kind or errors.PartialError)(f"{len(tally.failed)} of {tally.total} items failed")
+
+
+@contextlib.contextmanager
+def _batch_progress(tally: Any, wanted: bool) -> Iterator[Callable[[], None]]:
+    """A bar with the rate, the time that is left and how many failed, on stderr, where that is a terminal."""
+    if not wanted or not sys.stderr.isatty():
+        yield lambda: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn(compact=True))
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=tally.total)
+        yield lambda: bar.update(task, completed=tally.count, description=tally.rate_text())
 
 
 EPILOG_VERIFY = """\b
@@ -405,6 +513,134 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
             click.echo(f"  wrote {path}")
 
 
+EPILOG_RENDER = """\b
+Examples:
+  whitefurnace bake demo -o baked --for filament,three --size 64
+  whitefurnace render baked/demo.json --for filament -o grid.png
+  whitefurnace render baked/demo.json --for three -o gold.png --base-color 1 .78 .34 --rows 1 --exposure -1
+
+\b
+MANIFEST is the STEM.json of a bake. Roughness goes from 0 to 1 across, metalness from 0 to 1 down (one row: 1). The
+spheres are seen in parallel along -z with +y up; behind them is level 0, as a camera of 60 degrees sees it. The picture
+is in sRGB: radiance times 2^exposure, clipped at 1, without a tone curve.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 5 not supported (an engine that is given no
+prefiltered chain), 130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_RENDER)
+@click.argument("manifest", type=click.Path(path_type=Path))
+@click.option("-o", "--output", metavar="FILE.png", required=True, type=click.Path(path_type=Path), help="The picture.")
+@click.option("--for", "for_", metavar="ENGINE", required=True,
+              help="Whose files are read, and who is followed in how they are shaded: one that the bake was for.")
+@click.option("--size", type=int, default=128, show_default=True, help="Pixels a sphere's cell, 8 to 2048.")
+@click.option("--columns", type=int, default=7, show_default=True, help="Spheres across, roughness 0 to 1.")
+@click.option("--rows", type=int, default=3, show_default=True, help="Spheres down, metalness 0 to 1.")
+@click.option("--base-color", metavar="R G B", type=float, nargs=3, default=(1.0, 1.0, 1.0), help="[default: 1 1 1]")
+@click.option("--background", metavar="environment|plain", default="environment", show_default=True)
+@click.option("--exposure", metavar="EV", type=float, default=0.0, help="Multiply radiance by 2^EV.")
+@click.option("--force", is_flag=True, help="Replace FILE.png where it is there.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON row on stdout.")
+def render(manifest: Path, output: Path, as_json: bool, **options: Any) -> None:
+    """Draw a grid of spheres from the files that a bake made for an engine, shaded as that engine does."""
+    from whitefurnace import rendering, report
+
+    made = rendering.render(manifest, output, **options)
+    if as_json:
+        _json(report.rendered_row(made))
+        return
+    for notice in made.notices:
+        _say(f"notice: {made.engine}: {notice}")
+    click.echo(report.rendered_text(made))
+
+
+EPILOG_INSPECT = """\b
+Examples:
+  whitefurnace inspect baked/raw/studio.npz
+  whitefurnace inspect environment.env --json
+
+\b
+FILE is a .ktx, .ktx2, .dds, .env, .gltf or .glb, a .npz, .npy, .h or manifest of ours, harmonics as text, or an image.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read, 3 invalid input (truncated and corrupted files too), 130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_INSPECT)
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="One JSON row on stdout.")
+def inspect(file: Path, as_json: bool) -> None:
+    """Say what is in a texture, table or image: levels, ranges, key-values, whose it looks like, what we stated."""
+    from whitefurnace import contents, report
+
+    row = contents.described(contents.contents(file))
+    if as_json:
+        _json(report.finite(row))
+    else:
+        click.echo(report.inspect_text(row))
+
+
+EPILOG_COMPARE = """\b
+Examples:
+  whitefurnace compare studio.ktx baked/raw/studio.npz
+  whitefurnace compare theirs.dds ours.ktx2 --axes-a three --max-error 1e-2 --plot figures
+
+\b
+B is the reference. Of a level `error` is the 99th percentile of its texel errors, max over channels of
+|a - b| / max(b, 1e-3 of the level's mean), `worst` the largest and `rmse` the relative RMSE by solid angle; errors of
+tables are absolute, those of harmonics over the largest L00. Levels are matched by size, and by roughness where both
+files tell it; where no size is common, level 0 with level 0.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 5 not supported, 7 past --max-error,
+130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_COMPARE)
+@click.argument("a", type=click.Path(path_type=Path))
+@click.argument("b", type=click.Path(path_type=Path))
+@click.option("--max-error", metavar="X", type=float,
+              help="Exit 7 where `error` of a level, or `worst` of a table or of harmonics, is larger.")
+@click.option("--axes-a", metavar="AXES", help='Axes A is stored in, as "-x +y +z" or an engine. [default: ours]')
+@click.option("--axes-b", metavar="AXES", help="The same of B.")
+@click.option("--plot", "folder", metavar="DIR", type=click.Path(path_type=Path),
+              help="Draw error maps into this folder.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
+def compare(a: Path, b: Path, max_error: float | None, axes_a: str | None, axes_b: str | None, folder: Path | None,
+            as_json: bool) -> None:
+    """Compare cubes, lat-longs, tables and harmonics of two files, whatever containers they are in."""
+    from whitefurnace import comparison, report
+    from whitefurnace.contents import contents
+    from whitefurnace.errors import CheckError, UsageError
+
+    if max_error is not None and not 0 <= max_error < float("inf"):
+        raise UsageError(f"max-error {max_error} is outside [0, inf)")
+    if folder is not None:
+        _plots_into(folder)
+    found = comparison.compare(contents(a), contents(b), axes_a=axes_a, axes_b=axes_b)
+    for row in report.compared_rows(found) if as_json else ():
+        _json(row)
+    for notice in found.notices:
+        _say(f"notice: {notice}")
+    if not as_json:
+        click.echo(report.compared_text(found))
+    if folder is not None:
+        from whitefurnace import plots
+
+        path = plots.draw_comparison(folder, found)
+        if as_json:
+            _json({"event": "plot", "file": str(path)})
+        else:
+            click.echo(f"  wrote {path}")
+    if max_error is not None and (beyond := found.beyond(max_error)) is not None:
+        what = "error" if beyond.kind == "level" else "worst"
+        raise CheckError(f"{beyond.part} of {a} has {what} {beyond.bounded:.3g} against {b}, {max_error:g} is allowed")
+
+
 @cli.command(epilog="\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 one works, 4 none does.")
 @click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout.")
 def devices(as_json: bool) -> None:
@@ -446,6 +682,30 @@ def models(name: str | None, as_json: bool) -> None:
     else:
         click.echo(report.models_text(entries) if name is None else
                    "\n\n".join(report.model_text(entry) for entry in entries))
+
+
+@cli.command(epilog="\b\nExamples:\n  whitefurnace engines\n  whitefurnace engines filament\n"
+                    "  whitefurnace engines bevy --toml > my_engine.toml")
+@click.argument("name", required=False)
+@click.option("--toml", "as_toml", is_flag=True, help="As a file that --for takes, to begin your own engine with.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout.")
+def engines(name: str | None, as_toml: bool, as_json: bool) -> None:
+    """List the engines that `--for` knows, or one (a FILE.toml too): files, mapping, conventions, steps."""
+    from whitefurnace import report
+    from whitefurnace.engines import ENGINES, as_text
+    from whitefurnace.engines import engines as named
+    from whitefurnace.errors import UsageError
+
+    found = list(ENGINES.values()) if name is None else list(named(name))
+    if as_toml:
+        if name is None or len(found) > 1 or found[0].container != "files":
+            raise UsageError("--toml writes one engine: give a NAME, and neither raw nor exr")
+        click.echo(as_text(found[0]), nl=False)
+    elif as_json:
+        for engine in found:
+            _json({"event": "engine", **engine.data()})
+    else:
+        click.echo(report.engines_text(found) if name is None else "\n\n".join(map(report.engine_text, found)))
 
 
 def _plots_into(folder: Path) -> None:

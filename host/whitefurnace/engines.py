@@ -2,6 +2,7 @@
 data in a TOML file."""
 from __future__ import annotations
 
+import json
 import os
 import re
 from collections.abc import Sequence
@@ -150,6 +151,11 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
         """The mapping as a formula, for shaders."""
         return self.lods.lod or Expression(DEFAULT_LOD, LOD_NAMES, f"{self.name}: lod")
 
+    @property
+    def lods_text(self) -> str:
+        """The mapping for people."""
+        return self.lod if isinstance(self.lod, str) else ", ".join(f"{r:g} → {lod:g}" for r, lod in self.lod)
+
     @cached_property
     def bend_formula(self) -> Expression:
         return Expression(self.bend, ("r", "alpha"), f"{self.name}: bend")
@@ -217,7 +223,9 @@ _PRESETS = (
         "filament", "Filament: KTX 1 of R11G11B10F with its harmonics, and a skybox",
         facts="loaded and rendered by its WASM build, whose least roughness is .089; its desktop builds have .045",
         proven=True,
-        bend="alpha * alpha", least=0.045, sh="filament", dfg=Dfg(128, form="multiscatter", charlie=True),
+        # A level more than its own tool makes: what is read between levels errs by .6 to .7 of that.
+        bend="alpha * alpha", least=0.045, min_size=8, sh="filament",
+        dfg=Dfg(128, form="multiscatter", charlie=True),
         shading="scaled",
         file=(File("specular", "{stem}_ibl.ktx", "b10g11r11"), File("skybox", "{stem}_skybox.ktx", "b10g11r11"),
               File("sh", "{stem}_sh.txt"), File("dfg", "{stem}_dfg.ktx2", "rgba16f", 19)),
@@ -234,11 +242,11 @@ _PRESETS = (
               File("dfg", "{stem}_dfg.ktx2", "rg16f", 19)),
         # KTX2Loader of r187 refuses BC6H, which loses 8 % in small levels, and makes a 2-D texture of other cubes.
         steps=("const { mipmaps, format, type } = await ktx2Loader.loadAsync('STEM.ktx2')",
-               "const faces = [0, 1, 2, 3, 4, 5].map(f => ({ width: mipmaps[0].width, height: mipmaps[0].height, mipmaps: "
-               "mipmaps.map(({ data, width, height }) => ({ width, height, "
+               "const faces = [0, 1, 2, 3, 4, 5].map(f => ({ width: mipmaps[0].width, height: mipmaps[0].height, "
+               "mipmaps: mipmaps.map(({ data, width, height }) => ({ width, height, "
                "data: data.subarray(f * data.length / 6, (f + 1) * data.length / 6) })) }))",
-               "texture = new CompressedCubeTexture(faces, format, type); texture.minFilter = LinearMipmapLinearFilter; "
-               "texture.magFilter = LinearFilter; texture.isPMREMTexture = true; texture.needsUpdate = true",
+               "texture = new CompressedCubeTexture(faces, format, type); texture.magFilter = LinearFilter; "
+               "texture.minFilter = LinearMipmapLinearFilter; texture.isPMREMTexture = true; texture.needsUpdate = true",
                "scene.environment = texture; its last level is the diffuse light too",
                "before r187: scene.environment = the texture of RGBELoader for STEM.hdr, which it filters itself"),
     ),
@@ -257,6 +265,7 @@ _PRESETS = (
     Engine(
         "bevy", "Bevy: two KTX 2 of RGB9E5 with Zstandard",
         facts=_READ_BY_ITS_SOURCE,
+        min_size=4,  # levels at equal steps of r need two more for half the error between them
         lod="max_lod * r", axes="+x +y -z", least=0.089, dfg=Dfg(64), shading="fdez_aguera",
         # mix(n, r, s (√s + α)) with s = 1 - α [Lagarde2014, listing 22]
         bend="1 - (1 - alpha) * (sqrt(1 - alpha) + alpha)",
@@ -274,7 +283,7 @@ _PRESETS = (
     ),
     Engine(
         "khronos", "Khronos glTF Sample Viewer: KTX 2 of half floats, Lambert, GGX and Charlie",
-        facts=_READ_BY_ITS_SOURCE, lod="max_lod * r", dfg=Dfg(128, charlie=True), shading="khronos",
+        facts=_READ_BY_ITS_SOURCE, lod="max_lod * r", min_size=4, dfg=Dfg(128, charlie=True), shading="khronos",
         file=(File("specular", "{stem}_ggx.ktx2", "rgba16f", 19),
               File("irradiance", "{stem}_lambertian.ktx2", "rgba16f", 19),
               File("sheen", "{stem}_charlie.ktx2", "rgba16f", 19), File("dfg", "{stem}_dfg.ktx2", "rgba16f", 19)),
@@ -323,6 +332,29 @@ def engines(names: str) -> tuple[Engine, ...]:
             raise UsageError(f"two engines are named {engine.name!r}: their outputs would be the same files")
         chosen.append(engine)
     return tuple(chosen)
+
+
+def as_text(engine: Engine) -> str:
+    """An engine as the TOML that `user_engine` reads: what differs from the defaults."""
+    def value(x: Any) -> str:
+        if isinstance(x, bool):
+            return str(x).lower()
+        if isinstance(x, list | tuple):
+            return "[" + ", ".join(map(value, x)) + "]"
+        return json.dumps(x, ensure_ascii=False) if isinstance(x, str) else repr(x)
+
+    def lines(one: msgspec.Struct, left_out: Sequence[str] = ()) -> list[str]:
+        usual = dict(zip(one.__struct_fields__[::-1], one.__struct_defaults__[::-1], strict=False))
+        return [f"{name} = {value(getattr(one, name))}" for name in one.__struct_fields__ if name not in left_out and
+                getattr(one, name) is not None and (name not in usual or getattr(one, name) != usual[name])]
+
+    text = [f"# {engine.name}: {engine.facts}",
+            *lines(engine, ("name", "facts", "proven", "container", "latlong", "dfg", "file"))]
+    if table := lines(engine.dfg):
+        text += ["", "[dfg]", *table]
+    for file in engine.file:
+        text += ["", "[[file]]", *lines(file)]
+    return "\n".join(text) + "\n"
 
 
 MOST_BYTES = 1 << 20

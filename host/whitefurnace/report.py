@@ -12,7 +12,10 @@ if TYPE_CHECKING:
     from whitefurnace.baking import Baked
     from whitefurnace.benching import Case, Spread, Throughput, Yardstick
     from whitefurnace.catalogue import Model
+    from whitefurnace.comparison import Comparison
     from whitefurnace.device import Candidate
+    from whitefurnace.engines import Engine
+    from whitefurnace.rendering import Rendered
     from whitefurnace.tables import Table
     from whitefurnace.tradeoff import Cost, Missed, Point
     from whitefurnace.verification import Row
@@ -46,8 +49,10 @@ def baked_text(baked: Baked, output: Path) -> str:
         return planned_text(baked)
     m = baked.manifest
     rows = []
+    several = len({tuple(row.get("for", ())) for row in baked.levels}) > 1
     for k, row in enumerate(baked.levels):
-        rows.append([f"specular {k}", f"{row['size']}²", f"{row['roughness']:.3f}", f"{row['error']:.1e}",
+        what = f"{row.get('ndf', 'specular')} of {', '.join(row['for'])}" if several else f"specular {k}"
+        rows.append([what, f"{row['size']}²", f"{row['roughness']:.3f}", f"{row['error']:.1e}",
                      f"{row['worst']:.1e}", f"{row['rmse']:.1e}", row["method"], f"{row['seconds']:.2f} s"])
     wide = m.get("latlong_levels", [])
     for k, row in enumerate(wide):
@@ -72,16 +77,62 @@ def baked_text(baked: Baked, output: Path) -> str:
         lines.append(f"  sun: direction ({towards}), irradiance facing it ({triple}), π times the light colour c")
     lines += as_read_lines(baked.as_read)
     for relative, entry in sorted(m["files"].items()):
-        lines.append(f"  wrote {output / relative}  {size(entry['bytes'])}")
+        lines.append(f"  wrote {output / relative}  {size(entry['bytes'])}{_format_text(entry)}")
+    for name, engine in m.get("engines", {}).items():
+        if not engine["proven"]:
+            lines.append(f"  {name}: not proven in the engine ({engine['facts']})")
+        lines += [f"  {name}: {step.replace('STEM', baked.name)}" for step in engine["steps"]]
     lines.append(f"  wrote {output / (baked.name + '.json')}  the manifest; {baked.seconds:.2f} s in all")
     return "\n".join(lines)
 
 
+def engines_text(engines: Sequence[Engine]) -> str:
+    """The engines that `--for` knows, a row each."""
+    rows = [[e.name, e.title.partition(": ")[0], "seen" if e.proven else "", e.lods_text, e.sh or "",
+             "" if e.container != "files" else f"{e.dfg.size}² {e.dfg.form}"] for e in engines]
+    return table(["engine", "of", "proven", "lod(r)", "harmonics", "table"], rows, left=6)
+
+
+def engine_text(engine: Engine) -> str:
+    """One engine: its files and how they are read."""
+    lines = [f"{engine.name}: {engine.title}", f"  facts      {engine.facts}",
+             f"  lod(r)     {engine.lods_text}" + (", past r = 1 a lobe of that α" if engine.follow else ""),
+             f"  sizes      {engine.size}² to " + (f"{engine.levels} levels" if engine.levels else f"{engine.min_size}²"),
+             f"  axes       {engine.axes}"]
+    if engine.container == "files":
+        lines += [f"  direction  mix(mirror, normal, {engine.bend})"] if engine.bend != "0" else []
+        lines += [f"  radiance   mix(prefiltered, E/π, {engine.blend})"] if engine.blend != "0" else []
+        lines += [f"  least r    {engine.least:g}"] if engine.least else []
+        lines += [f"  harmonics  {engine.sh}"] if engine.sh else []
+        d = engine.dfg
+        lines += [f"  table      {d.size}², x = {d.x}, y = {d.y}, {d.form}" + (", Charlie" if d.charlie else "")]
+        lines += [f"  file       {file.name.replace('{stem}', 'STEM')}: {file.holds}, {file.stored}" for file in engine.file]
+        lines += [f"  step       {step}" for step in engine.steps]
+    return "\n".join(lines)
+
+
+def _format_text(entry: Mapping[str, Any]) -> str:
+    """A file's pixel format and what it costs, beside the error of what it holds."""
+    if "format" not in entry:
+        return ""
+    levels = entry.get("levels", ())
+    parts = [entry["format"]]
+    if levels:
+        parts.append(f"error {max(level['error'] for level in levels):.1e}")
+        costs = [level["format_p99"] for level in levels if "format_p99" in level]
+        parts += [f"its format's {max(costs):.1e}"] if costs else []
+    elif "error" in entry:
+        parts.append(f"error {entry['error']:.1e}")
+        parts += [f"its format's {entry['format_worst']:.1e}"] if "format_worst" in entry else []
+    return "  " + ", ".join(parts)
+
+
 def planned_text(baked: Baked) -> str:
     """What a bake would do."""
-    methods = [f"{p.grid}²" if p.grid else f"{p.samples} samples" if p.samples else "texel mean" for p in baked.plan]
-    rows = [[f"specular {k}", f"{p.size}²", f"{p.roughness:.3f}", methods[k], f"{p.pairs:.2g}", f"{p.cuts}×{p.cuts}"]
-            for k, p in enumerate(baked.plan)]
+    several = len({names for names, _ in baked.plan}) > 1
+    rows = [[f"specular of {', '.join(names)}" if several else f"specular {k}", f"{p.size}²", f"{p.roughness:.3f}",
+             f"{p.grid}²" if p.grid else f"{p.samples} samples" if p.samples else "texel mean", f"{p.pairs:.2g}",
+             f"{p.cuts}×{p.cuts}"] for k, (names, p) in enumerate(baked.plan)]
     lines = [f"{baked.name}: would bake, key {baked.manifest['key'][:12]}…",
              table(["", "size", "r", "source grid a face", "lobe evaluations", "nodes a texel"], rows)]
     for path, nbytes in zip(baked.files, baked.nbytes, strict=True):
@@ -97,20 +148,25 @@ def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
     if not found:
         return []
     parts = [part for part in AS_READ if any(part in read["parts"] for read in found)]
-    rows = [[str(read["levels"]), f"{read['sizes'][-1]}²", read["fit"] or "own lobe",
+    several = len({read.get("for") for read in found}) > 1
+    rows = [[read["for"] if several else "", str(read["levels"]), f"{read['sizes'][-1]}²", read["fit"] or "own lobe",
              *(f"{read['parts'][part]['mean']:.2g}" if part in read["parts"] else "" for part in parts),
              f"{read['parts']['all' if 'all' in read['parts'] else 'between']['p95']:.2g}"] for read in found]
-    return [f"  as read from {found[0]['format']}: error of what engines show, mean over r of the RMS over directions",
-            table(["levels", "last", "fit", *parts, "p95"], rows, left=3)]
+    formats = ", ".join(dict.fromkeys(read["format"] for read in found))
+    head = ["for", "levels", "last", "fit"]
+    if not several:
+        rows, head = [row[1:] for row in rows], head[1:]
+    return [f"  as read from {formats}: error of what engines show, mean over r of the RMS over directions",
+            table([*head, *parts, "p95"], rows, left=len(head))]
 
 
 def baked_rows(baked: Baked) -> list[dict[str, Any]]:
     """JSON rows of a bake: one a level, then one for the whole."""
     rows: list[dict[str, Any]] = []
     if baked.state == "planned":
-        rows += [{"event": "level", "name": baked.name, "level": k, "size": p.size, "roughness": p.roughness,
-                  "grid": p.grid, "samples": p.samples, "pairs": p.pairs, "cuts": p.cuts}
-                 for k, p in enumerate(baked.plan)]
+        rows += [{"event": "level", "name": baked.name, "level": k, "for": list(names), "size": p.size,
+                  "roughness": p.roughness, "grid": p.grid, "samples": p.samples, "pairs": p.pairs, "cuts": p.cuts}
+                 for k, (names, p) in enumerate(baked.plan)]
     else:
         rows += [{"event": "level", "name": baked.name, "level": k, **row} for k, row in enumerate(baked.levels)]
     rows += [{"event": "as_read", "name": baked.name, **read} for read in baked.as_read]
@@ -150,12 +206,21 @@ def _told_of_table(m: Mapping[str, Any]) -> list[str]:
     """What a manifest says of a table beside its error."""
     lines = []
     if "channels" in m:
-        lines += [f"  channels  {', '.join(m['channels'])}", f"  formula   {m['formula']}"]
+        lines.append(f"  channels  {', '.join(m['channels'])}")
+        lines += [f"  formula   {m['formula']}"] if "formula" in m else []
+    if "stored" in m:
+        lines += [f"  stored as {m['stored']['format']}: off by {m['stored']['error']:.1e} at most, beside the error"]
     if "furnace" in m:
         lines += [f"  furnace at F = 1: off by {m['furnace']:.1e}; "
                   f"f(l, v) and f(v, l) differ by {m['non_reciprocity']:.2g}",
                   "  off Kulla and Conty's at F0 = " +
                   ", ".join(f"{f0}: {off:.1e}" for f0, off in m["deviation"].items())]
+    if "misplaced" in m:
+        told = {f"at texels, {k}": e for k, e in m["misplaced"].items() if k != "between"}
+        told |= {f"between, {k}": e for k, e in m["misplaced"].get("between", {}).items()}
+        names = ("mean", "median", "p99", "max")
+        lines.append(table(["  energy misplaced", *names],
+                           [(f"  {where}", *(f"{e[k]:.3f}" for k in names)) for where, e in told.items()]))
     if "as_read" in m:
         read = m["as_read"]
         rows = [(name, *(f"{e[k]:.1e}" for k in ("p99", "max", "max_all"))) for name, e in
@@ -265,6 +330,11 @@ def verify_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
              "note": r.note, "counterexample": _plain(r.counterexample)} for r in rows]
 
 
+def finite(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row as JSON has it: NaN and infinities as strings."""
+    return {name: _plain(value) for name, value in row.items()}
+
+
 def _plain(value: Any) -> Any:
     """As JSON has it."""
     if isinstance(value, Mapping):
@@ -356,3 +426,116 @@ def tradeoff_rows(found: Sequence[Point | Missed | Cost]) -> list[dict[str, Any]
         row = {**vars(one), "event": type(one).__name__.lower()}
         rows.append({name: _three(value) if name == "seconds" else value for name, value in row.items()})
     return rows
+
+
+# ---------------------------------------------------------------------------------------------- files
+
+
+def inspect_text(row: Mapping[str, Any]) -> str:
+    """What is in a file, from the row of `contents.described`."""
+    lines = [f"{row['file']}: {row['kind']} in {row['container']}, {row['format']}"]
+    header = {**row["header"], **({"bytes": size(row["header"]["bytes"])} if "bytes" in row["header"] else {})}
+    for name in ("layers", "orientation"):
+        if not header.get(name, 1):
+            del header[name]
+    lines.append("  " + ", ".join(f"{name} {value}" for name, value in header.items()))
+    lines += [f"  notice: {notice}" for notice in row["notices"]]
+    if row["levels"]:
+        lines.append(table(["", "size", "r", "bytes", "least", "mean", "largest", "error", "format", "to know"],
+                           [_inspected(level) for level in row["levels"]]))
+    if "sh" in row:
+        lines.append("  spherical harmonics: mean radiance " +
+                     ", ".join(f"{x * math.sqrt(1 / (4 * math.pi)):.4g}" for x in row["sh"][0]))
+    proven = row["statement"] is not None and row["statement"]["manifest"] is not None
+    for key, value in row["keys"].items():
+        if proven and key.startswith("whitefurnace:"):  # the manifest says the same, and more
+            continue
+        first, *rest = str(value).splitlines() or [""]
+        first = first if len(first) <= 70 else first[:70] + "…"
+        lines.append(f"  key {key}: {first}" + (f" … {len(rest)} more lines" if rest else ""))
+    lines += [f"  looks like a file of {said}" for said in row["looks_like"]]
+    return "\n".join([*lines, *_stated(row["statement"])])
+
+
+def _inspected(level: Mapping[str, Any]) -> list[str]:
+    count = {name: level[name] for name in ("nan", "infinite", "negative", "at_limit") if level[name]}
+    names = {"nan": "NaN", "infinite": "infinite", "negative": "negative", "at_limit": "at the format's limit"}
+    said = [f"{value} {names[name]}" for name, value in count.items()]
+    said += [f"alpha {level['alpha'][0]:.3g} … {level['alpha'][1]:.3g}"] if level["alpha"] else []
+    mean, added = level["mean"], level.get("format_p99", level.get("format_worst"))
+    return [level["name"], level["size"],
+            "" if level["roughness"] is None else f"{level['roughness']:.3f}",
+            "" if level["bytes"] is None else size(level["bytes"]), f"{level['low']:.3g}",
+            " ".join(f"{x:.3g}" for x in mean), f"{level['high']:.4g}",
+            f"{level['error']:.1e}" if "error" in level else "",
+            "" if added is None else f"{added:.1e}", ", ".join(said)]
+
+
+def _stated(statement: Mapping[str, Any] | None) -> list[str]:
+    """What a manifest or our attributes say of a file."""
+    if statement is None:
+        return ["  no manifest lists it, and it states no error"]
+    told = []
+    if statement["manifest"] is not None:
+        told.append(f"  manifest {statement['manifest']}: " + (
+            "the digests match" if statement["whole"] else "what it lists is NOT what is there, it was changed since"))
+    version = statement.get("whitefurnace", statement.get("version"))
+    key = statement.get("key")
+    made = [f"whitefurnace {version}"] if version else []
+    made += [f"key {str(key)[:12]}…"] if key else []
+    device = statement.get("device")
+    made += [f"for {statement['engine']}"] if statement.get("engine") else []
+    made += [f"on {device.get('name')}"] if isinstance(device, Mapping) else []
+    if made:
+        told.append(f"  made by {', '.join(made)}")
+    recipe = statement.get("recipe")
+    if isinstance(recipe, Mapping):
+        shown = {name: _short(value) for name, value in recipe.items() if value is not None}
+        told.append("  recipe " + ", ".join(f"{name} {value if len(value) <= 60 else value[:60] + '…'}"
+                                            for name, value in shown.items()))
+    if isinstance(statement.get("integral"), str):
+        error = statement.get("error")
+        told.append(f"  integral {statement['integral']}" + (
+            f", error {error:.1e}" if isinstance(error, float) else ""))
+    return told
+
+
+def _short(value: Any) -> str:
+    """A value of a recipe on one line; what a model is called, where it is one."""
+    if isinstance(value, Mapping):
+        return str(value["name"]) if "name" in value else "/".join(f"{k}={_short(v)}" for k, v in value.items())
+    if isinstance(value, list | tuple):
+        return "+".join(_short(v) for v in value)
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def compared_text(found: Comparison) -> str:
+    """A is off from B by so much, part by part."""
+    rows = [[row.part, row.size, "" if row.roughness is None else f"{row.roughness:.3f}", f"{row.error:.1e}",
+             f"{row.worst:.1e}", "" if row.rmse is None else f"{row.rmse:.1e}",
+             "" if row.stated is None else f"{row.stated:.1e}", row.method, row.at] for row in found.rows]
+    head = ["", "size", "r", "error", "worst", "rmse", "stated", "compared", "the worst at"]
+    lines = [f"{found.a.path} ({found.a.kind}, {found.a.container}) against "
+             f"{found.b.path} ({found.b.kind}, {found.b.container})"]
+    return "\n".join([*lines, table(head, rows)])
+
+
+def compared_rows(found: Comparison) -> list[dict[str, Any]]:
+    """JSON rows of a comparison."""
+    return [{"event": "compared", "part": row.part, "kind": row.kind, "size": row.size, "roughness": row.roughness,
+             "error": _plain(row.error), "worst": _plain(row.worst), "rmse": _plain(row.rmse), "stated": row.stated,
+             "method": row.method, "worst_at": row.at} for row in found.rows]
+
+
+# ---------------------------------------------------------------------------------------------- pictures
+
+
+def rendered_row(made: Rendered) -> dict[str, Any]:
+    return {"event": "rendered", **vars(made), "path": str(made.path)}
+
+
+def rendered_text(made: Rendered) -> str:
+    columns, rows = (" ".join(f"{x:.3g}" for x in values) for values in (made.roughness, made.metalness))
+    return "\n".join([f"{made.path}: {made.width} × {made.height} pixels, {made.engine}, exposure {made.exposure:g}",
+                      f"  across  roughness {columns}", f"  down    metalness {rows}",
+                      *(f"  read    {path}" for path in made.read)])
