@@ -20,6 +20,7 @@ from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import (
     decode_srgb,
     digest_file,
+    image_facts,
     is_light,
     light_digest,
     light_files,
@@ -153,12 +154,7 @@ def environment(
     Raises `UsageError` for an option out of its domain, `FileError` for what cannot be read, and `InputError`
     for what was read and is not an environment.
     """
-    if not _is_number(rotate):
-        raise UsageError(f"rotate is {rotate!r}, a finite angle in degrees was expected")
-    if not _is_number(exposure) or abs(exposure) > 64:
-        raise UsageError(f"exposure is {exposure!r}, a number of EV in [-64, 64] was expected")
-    if nonfinite not in ("refuse", "zero"):
-        raise UsageError(f"nonfinite is {nonfinite!r}, 'refuse' or 'zero' was expected")
+    check_options(rotate, exposure, nonfinite)
     turn = math.radians(math.remainder(rotate, 360.0))
     zero = nonfinite == "zero"
 
@@ -189,6 +185,16 @@ def environment(
     return replace(found, statistics=statistics_of(found))
 
 
+def check_options(rotate: object, exposure: object, nonfinite: object) -> None:
+    """Raises `UsageError` for an option of `environment` out of its domain."""
+    if not _is_number(rotate):
+        raise UsageError(f"rotate is {rotate!r}, a finite angle in degrees was expected")
+    if not _is_number(exposure) or abs(exposure) > 64:  # type: ignore[arg-type]
+        raise UsageError(f"exposure is {exposure!r}, a number of EV in [-64, 64] was expected")
+    if nonfinite not in ("refuse", "zero"):
+        raise UsageError(f"nonfinite is {nonfinite!r}, 'refuse' or 'zero' was expected")
+
+
 def _is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
 
@@ -205,6 +211,26 @@ def source_digest(source: str | os.PathLike[str]) -> str:
     if os.path.isdir(path):
         return _of_faces(digest_file(face) for face in _face_paths(path))
     return light_digest(path)
+
+
+def extent(source: str | os.PathLike[str]) -> tuple[str, int, int]:
+    """("latlong" or "cube", rows, columns of it or of a face) by the header alone. Raises as `environment` does for a
+    header; of a texture level 0 is read."""
+    path = Path(source)
+    if os.path.isdir(path):
+        size = image_facts(_face_paths(path)[0]).height
+        return "cube", size, size
+    if is_light(path):
+        pixels, cube = read_radiance(path)
+        if cube:
+            return "cube", pixels.shape[1], pixels.shape[2]
+        height, width = pixels.shape[:2]
+    else:
+        facts = image_facts(path)
+        height, width = facts.height, facts.width
+    layout = _layout_of((height, width), str(path))
+    size = width // layout.columns
+    return ("cube", size, size) if layout.cells else ("latlong", height, width)
 
 
 def _of_faces(digests: Iterable[str]) -> str:

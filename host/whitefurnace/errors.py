@@ -54,6 +54,11 @@ class PartialError(WhitefurnaceError):
     exit_code = 8
 
 
+def of_code(code: int) -> type[WhitefurnaceError] | None:
+    """The class with an exit code, or None."""
+    return next((kind for kind in WhitefurnaceError.__subclasses__() if kind.exit_code == code), None)
+
+
 def nearest(name: str, choices: Iterable[str]) -> str:
     """`; did you mean 'x'?` for the choice closest to `name`, or the list of choices, if there is any."""
     choices = list(choices)

@@ -2,10 +2,11 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache, wraps
 from importlib import resources
+from typing import Any
 
 from whitefurnace.catalogue import Integral, Model
 
@@ -74,6 +75,30 @@ def _assemble(parts: Sequence[str | tuple[str, str]]) -> Source:
         lines.append(f'#line 1 "{quoted}"\n{text.rstrip()}\n')
     whole = "".join(lines)
     return Source(whole, hashlib.sha256(whole.encode()).hexdigest())
+
+
+class _Very:
+    """A model as the key of what is made from it: this very entry, not one of the same name."""
+
+    def __init__(self, entry: Model) -> None:
+        self.entry = entry
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Very) and self.entry is other.entry
+
+    def __hash__(self) -> int:
+        return id(self.entry)
+
+
+def _kept(make: Callable[..., Source]) -> Callable[..., Source]:
+    """The same text for the same arguments: a level asks for its programs at every launch."""
+    made = lru_cache(maxsize=64)(lambda *given: make(*(g.entry if isinstance(g, _Very) else g for g in given)))
+
+    @wraps(make)
+    def found(*given: Any) -> Source:
+        return made(*(_Very(g) if isinstance(g, Model) else g for g in given))
+
+    return found
 
 
 def arguments(function: str, isotropic: bool = True) -> str:
@@ -284,6 +309,7 @@ def frame_nodes(kind: str) -> Source:
     return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", "radiance_texels.cl"])
 
 
+@_kept
 def convolution(ndf: Model | None) -> Source:
     """The zonal convolution with the lobe of an NDF, or with the cosine lobe of irradiance for None."""
     if ndf is None:
@@ -292,6 +318,7 @@ def convolution(ndf: Model | None) -> Source:
                       "lobe.clh", "prefilter.cl"])
 
 
+@_kept
 def near_texels(kind: str, ndf: Model) -> Source:
     """The exact integral of a narrow lobe over the texels near its direction, of a source of the kind "latlong" or
     "cube"."""
@@ -299,11 +326,13 @@ def near_texels(kind: str, ndf: Model) -> Source:
                       *_models({"ndf": ndf}, 0), "window.clh", "lobe.clh", "exact.cl"])
 
 
+@_kept
 def octahedral() -> Source:
     """The zonal convolution by the symmetries of the cube, of any lobe."""
     return _assemble(["real.clh", "sphere.clh", "orbits.clh", "window.clh", "lobe_table.clh", "octahedral.cl"])
 
 
+@_kept
 def apart(ndf: Model | None) -> Source:
     """The excess of bright texels under the lobe of an NDF, or under the cosine of irradiance for None."""
     if ndf is None:
@@ -312,22 +341,36 @@ def apart(ndf: Model | None) -> Source:
                       *_models({"ndf": ndf}, 0), "lobe.clh", "apart.cl"])
 
 
+@_kept
 def interpolation() -> Source:
     """Levels from their values at the nodes of a grid."""
     return _assemble(["real.clh", "sphere.clh", "grid.clh", "interpolate.cl"])
 
 
+@_kept
 def texels(kind: str) -> Source:
     """Nodes and anterpolation of a source of the kind "latlong" or "cube", and spherical harmonics."""
     return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", "grid.clh", "anterpolate.cl",
                       "harmonics.cl"])
 
 
+@_kept
 def samples() -> Source:
     """The pyramid of a cube, and filtered importance sampling of it."""
     return _assemble(["real.clh", "sphere.clh", "pyramid.cl", "samples.cl"])
 
 
+def truth(slots: Mapping[str, Model], how: str, sets: int, area_terms: int = 0) -> Source:
+    """The reflectance integral of surface points: of the slots ndf, masking and fresnel, or of a diffuse model, with
+    directions drawn as `how` says, for `sets` sets of numbers."""
+    defines = f"#define {how}\n#define SETS {sets}\n"
+    # samples.cl makes reals of what special.clh calls bits: one macro, of either.
+    return _assemble(["real.clh", "sphere.clh", ("bindings", defines + _bindings(slots, cells=(), area_terms=area_terms)),
+                      *_models(slots, area_terms), ("between", "#undef TO_REAL\n"), "pyramid.cl", "samples.cl",
+                      "truth.cl"])
+
+
+@_kept
 def overlap() -> Source:
     """Exact areas of overlap, for level 0."""
     return _assemble(["real.clh", "sphere.clh", "overlap.cl"])

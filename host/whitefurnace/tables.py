@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from whitefurnace import bilinear, curves, glass, ltc
+from whitefurnace import bilinear, curves, diffusion, glass, ltc
 from whitefurnace.catalogue import integral
 from whitefurnace.device import Device, choose_device
 from whitefurnace.energy import KINDS as OF_ENERGY
@@ -24,10 +24,14 @@ from whitefurnace.engines import Dfg, engines
 from whitefurnace.environments import environment as load
 from whitefurnace.errors import FileError, UnsupportedError, UsageError, nearest
 from whitefurnace.files import (
+    Lock,
     Transaction,
+    acquire,
     check_table,
     digest_file,
+    finish,
     identifier,
+    lock_path,
     read_manifest,
     release,
     scratch,
@@ -62,6 +66,8 @@ KINDS["smith"] = Kind("smith", "ggx", curves.SCHEMES, curves.smith, check=curves
                       axes=curves.SMITH_AXES, shape=curves.shape_of_smith)
 KINDS["norm"] = Kind("norm", "abc", (), curves.norm, check=curves.norm_check, of="normalization",
                      axes_of=curves.norm_axes, shape=curves.shape_of_norm, tolerance=curves.NORM_TOLERANCE)
+KINDS["diffusion"] = Kind("diffusion", "", diffusion.SCHEMES, diffusion.diffusion, of="normalization",
+                          axes=diffusion.AXES, channels=3, demand=diffusion.demand)
 OPTIONS = frozenset(inspect.signature(integrate).parameters) - {"parameters"}
 
 
@@ -278,7 +284,7 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
     if kind == "dfg":
         scheme = _form(scheme)
     elif own is None and scheme is not None:
-        raise UsageError(f"{kind} has no scheme; dfg, energy, glass and ltc have")
+        raise UsageError(f"{kind} has no scheme; dfg, energy, glass, ltc and diffusion have")
     entry = integral(own.integral(scheme) if own else kind)
     path = Path(path)
     form = path.suffix.lower()
@@ -297,6 +303,9 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
     tolerance = usual[precision] if tolerance is None else tolerance
     if not is_number(tolerance) or not 0 < tolerance < 1:  # also NaN
         raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
+    bare = own.demand if own else None
+    if bare and (ndf, masking, fresnel, diffuse, brdf) != (None,) * 5:
+        raise UnsupportedError(f"{kind} is of a medium alone: give no ndf, masking, fresnel, diffuse or brdf")
     lone = own is not None and own.slot == "fresnel"
     if lone and not (ndf is None and masking is None and diffuse is None and brdf is None):
         raise UnsupportedError(f"{kind} is of Fresnel's term alone: give a fresnel, and no ndf, masking, diffuse or "
@@ -312,6 +321,7 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
              "diffuse": diffuse, "brdf": brdf}
     if lone:
         given = {"fresnel": fresnel or own.model}  # type: ignore[union-attr]
+    given = {} if bare else given
     # Chosen once: a user's file is read once, and what was read is what the key is of.
     models = {slot: chosen(slot, spec) for slot, spec in given.items() if spec is not None}
     numbers = {name: _number(name, value) for name, value in {**(parameters or {}), **fixed}.items()}
@@ -322,12 +332,17 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
         own_axes = {name: one for name, one in own_axes.items() if name != "roughness"}
     axes = {**{name: own_axes[name] for name in own_axes if not {name, f"fresnel_{name}"} & {*numbers, *(axes or {})}},
             **(axes or {})}
+    if bare:  # in the order of the usual ones, which are of the table's size
+        counts = dict(zip(own_axes, _sizes(size), strict=False))
+        axes = {name: (*axes[name][:2], counts[name], axes[name][3]) if axes[name] is own_axes.get(name) else axes[name]
+                for name in (*own_axes, *axes) if name in axes}
     scaled = {name: given for name, given in axes.items() if given in SCALES}  # a default axis, scaled
     explicit = {name: axis(name, given) for name, given in axes.items() if name not in scaled}
     for name in (*numbers, *explicit, *scaled):
         if name in OPTIONS:
             raise UsageError(f"{name} is an option and no parameter; a model's own of that name is SLOT_{name}")
-    placed = _placed(entry.view, models, _sizes(size), explicit, numbers, scaled, own is not None and own.fitted)
+    sizes = (*_sizes(size)[:2], _sizes(size)[2] and not bare)
+    placed = _placed(entry.view, models, sizes, explicit, numbers, scaled, own is not None and own.fitted)
     if preset:
         placed = tuple(sorted(placed, key=lambda one: (preset.x, preset.y).index(one.name)))
     if form == ".exr" and len(placed) > 2:
@@ -345,8 +360,8 @@ def order(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence
     columns = _columns(placed, models, numbers)
     lit, around = _lit(kind, light, environment, normal, rotate, exposure, nonfinite)
     what: dict[str, Any] = {**models, **columns, "backfacing": backfacing}
-    asked = (fresnel_demand(models, columns) if lone else radiance_demand(light=lit.get("light"), **what) if lit else
-             demand(entry.name, **what))
+    asked = (bare(scheme, columns) if bare else fresnel_demand(models, columns) if lone else
+             radiance_demand(light=lit.get("light"), **what) if lit else demand(entry.name, **what))
     if own and not lone:
         asked = replace(asked, shape=(*asked.shape[:len(np.broadcast_shapes(*map(np.shape, columns.values())))],
                                       own.channels))
@@ -422,6 +437,18 @@ def _lit(kind: str, light: Spec | None, around: Any, normal: Sequence[float] | N
     return {"environment": env, "normal": up}, {"environment": {
         "sha256": env.digest, "rotate": round(math.degrees(env.rotation), 9), "exposure": env.exposure,
         "nonfinite": nonfinite, "normal": list(up)}}
+
+
+def named(option: str, given: Sequence[str]) -> dict[str, str]:
+    """NAME=VALUE of an option `axis` or `set` by name, however it is spelled. Raises UsageError."""
+    found: dict[str, str] = {}
+    for item in given:
+        name, equals, value = item.partition("=")
+        if not (name.isidentifier() and equals and value) or name in found:
+            form = "NAME=A:B:N[:SCALE]" if option.endswith("axis") else "NAME=VALUE"
+            raise UsageError(f"{option} {item!r}: {name or 'a name'} must be given once, as {form}")
+        found[name] = value
+    return found
 
 
 def _usual(choice: Chosen, fixed: Mapping[str, float], count: int) -> dict[str, Axis]:
@@ -527,8 +554,9 @@ def lut(kind: str, path: str | os.PathLike[str], *, device: Device | str | None 
     axes and form), "energy" (what multiple scattering gives back, `scheme` "kulla_conty", "turquin" or
     "fdez_aguera"), "sheen", "fresnel_average" or "ltc" (linearly transformed cosines, `scheme` "free" or "heitz",
     as one array or as the textures "ltc_1" and "ltc_2"), "glass" (what a rough boundary reflects and lets through,
-    `scheme` "entering" or "leaving"), "smith" or "norm" (coefficients of simpler curves, to .h or .npy). `path` ends
-    with .npy, .exr, .png, .ktx2, .dds or .h.
+    `scheme` "entering" or "leaving"), "smith" or "norm" (coefficients of simpler curves, to .h or .npy), or "diffusion"
+    (diffuse light on a body of some curvature under whose surface light travels, `scheme` "skin", "burley", "dipole" or
+    a measured medium). `path` ends with .npy, .exr, .png, .ktx2, .dds or .h.
 
     options: size (N, (N, M) or "NxM"; 128, 64 for ltc), axes ({name: (A, B, N[, "linear" | "log" | "centres" | "sqrt" |
     "f0" | "angle"])}, or a scale alone for a default axis), stored (the format of texels, as "rg16f" or "r8"), fit
@@ -539,7 +567,8 @@ def lut(kind: str, path: str | os.PathLike[str], *, device: Device | str | None 
 
     The array is […, y, x(, c)] of float32 or float64. x is NoV = (x + ½)/N for integrals with a view, y perceptual
     roughness r = (y + ½)/M, row 0 smoothest, which the models' own parameters follow; without a view r alone is x; of
-    ltc x is r from 0 to 1 and NoV = 1 - y². A parameter that is given stays put; an axis of the same name replaces a
+    ltc x is r from 0 to 1 and NoV = 1 - y²; of diffusion x is NoL from -1 to 1 and y the curvature in 1/mm from 0 to 1,
+    both at centres. A parameter that is given stays put; an axis of the same name replaces a
     default one, others come after it, slower, in their order. More than two want .npy, .h, .ktx2 or .dds. What exists
     with the same key is skipped, what the manifest proves ours replaced, and anything else needs `force`. Raises
     UsageError, UnsupportedError, FileError, CheckError, DeviceError.
@@ -559,15 +588,34 @@ def make(request: Order, device: Device | str | None = None, *, dry_run: bool = 
 def _make(request: Order, device: Device | str | None, dry_run: bool, progress: Progress | None) -> Table:
     begin = time.perf_counter()
     key = request.key()
-    there = _manifest_at(request.manifest_path, request)
+    there = _manifest_at(request.manifest_path, request.path.name)
     plain = Table(request.path, "planned", request.shape, request.axes, request.nbytes,
                   {"key": key, "recipe": request.canonical()})
     if not request.force and there and there.get("key") == key and _proves(there, request.path):
+        if not dry_run:
+            tidy(request.manifest_path)
         return replace(plain, state="skipped", manifest=there, seconds=time.perf_counter() - begin)
     _check_ownership(request, there)
     if dry_run:
         return plain
-    on = device if isinstance(device, Device) else choose_device(device)
+    lock = acquire(lock_path(request.manifest_path))
+    assert lock is not None
+    try:
+        there = _settle(request.manifest_path, lock)
+        if not request.force and there and there.get("key") == key and _proves(there, request.path):
+            return replace(plain, state="skipped", manifest=there, seconds=time.perf_counter() - begin)
+        _check_ownership(request, there)
+        lock.note([request.path, request.manifest_path])
+        return _made(request, device, key, plain, begin, progress)
+    finally:
+        lock.release()
+
+
+def _made(request: Order, device: Device | str | None, key: str, plain: Table, begin: float,
+          progress: Progress | None) -> Table:
+    """Makes and writes the table."""
+    hosted = request.kind in KINDS and KINDS[request.kind].demand is not None
+    on: Any = device if isinstance(device, Device) else None if hosted else choose_device(device)
     made: list[Integrated] = []
     told: dict[str, Any] = {}
 
@@ -598,7 +646,7 @@ def _make(request: Order, device: Device | str | None, dry_run: bool, progress: 
             _exr(request, key, fill, made, told, transaction)
         told.pop("text", None)  # of a header
         staged = transaction.staged(request.path)
-        manifest = {**_manifest(request, key, on, made[0]), **told}
+        manifest = {**_manifest(request, key, None if hosted else on, made[0]), **told}
         manifest |= {"sha256": digest_file(staged), "bytes": staged.stat().st_size}
         write_manifest(request.manifest_path, manifest, into=transaction)
         transaction.commit()
@@ -730,7 +778,8 @@ def _texture(request: Order, key: str, fill: Callable[[np.ndarray], None], made:
              for name, value in whole.items() if name not in ("name", "whitefurnace")}
     dimensions = max(len(request.axes), 2)
     order_ = ", ".join(["wvuzyx"[-dimensions:][k] for k in range(dimensions)])
-    comment = [f"{request.kind} of " + ", ".join(f"{slot} {c.model.name}" for slot, c in request.models.items()) +
+    of = ", ".join(f"{slot} {c.model.name}" for slot, c in request.models.items()) or request.scheme
+    comment = [f"{request.kind} of {of}" +
                f", as [{order_}{', channel' if len(request.shape) > dimensions else ''}]; whitefurnace {VERSION}",
                *(f"{name}: {along}" for name, along in zip("xyzuvw", request.axes, strict=False)),
                *(f"{name} = {value:g}" for name, value in request.fixed.items()),
@@ -753,9 +802,35 @@ def _manifest(request: Order, key: str, device: Device | None, made: Integrated)
 # ---------------------------------------------------------------------------------------------- ownership
 
 
-def _manifest_at(path: Path, request: Order) -> dict[str, Any] | None:
+def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
     found = read_manifest(path)
-    return found if found is not None and found.get("name") == request.path.name else None
+    return found if found is not None and found.get("name") == name else None
+
+
+def tidy(path: Path) -> None:
+    """Completes or removes what a run that was killed left of the table with the manifest at `path`, unless another run
+    is at it. Raises FileError."""
+    if lock_path(path).exists() and (lock := acquire(lock_path(path), wait=False)):
+        try:
+            _settle(path, lock)
+        finally:
+            lock.release()
+
+
+def _settle(path: Path, lock: Lock) -> dict[str, Any] | None:
+    """Completes what a run that was killed between its renames left staged, removes what it left otherwise, and gives
+    the manifest that is there then."""
+    name, staging = path.name.removesuffix(".json"), Transaction.staging(path)
+    there, staged = _manifest_at(path, name), _manifest_at(staging, name)
+    if staged and (there or not os.path.lexists(path)):
+        renames = finish(path, {name: staged.get("sha256")}, {name: {m.get("sha256") for m in (there, staged) if m}})
+        if renames is not None:
+            for source, target in renames:
+                os.replace(source, target)
+            there, staged = staged, None
+    # What could not be completed still proves whose the renamed file is.
+    lock.sweep(keep=[staging] if staged else ())
+    return there
 
 
 def _proves(manifest: Mapping[str, Any], path: Path) -> bool:
@@ -771,7 +846,7 @@ def _check_ownership(request: Order, there: dict[str, Any] | None) -> None:
     if request.force:
         return
     # Ours is also what a run that was killed between its renames left staged.
-    known = [m for m in (there, _manifest_at(Transaction.staging(beside), request)) if m]
+    known = [m for m in (there, _manifest_at(Transaction.staging(beside), request.path.name)) if m]
     for target in (path, beside):
         ours = any(_proves(m, path) for m in known) if target == path else bool(known)
         if target.exists() and not ours:

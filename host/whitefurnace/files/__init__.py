@@ -6,11 +6,13 @@ from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
 from whitefurnace.files.containers import is_texture, read_texture, write_texture
 from whitefurnace.files.env import EnvMap, read_env, write_env
 from whitefurnace.files.exr import write_exr
+from whitefurnace.files.gltf import Gltf
 from whitefurnace.files.gltf_lights import GltfLight, read_gltf_lights, write_gltf_lights
 from whitefurnace.files.harmonics import read_sh
 from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
-from whitefurnace.files.image import Image, decode_srgb, read_image
-from whitefurnace.files.lights import Light, is_light, light_digest, read_light, read_radiance
+from whitefurnace.files.image import Image, decode_srgb, read_image, srgb_table
+from whitefurnace.files.lights import Light, is_light, light_digest, light_files, read_light, read_radiance
+from whitefurnace.files.lock import Lock, acquire, finish, is_lock, is_safe, lock_path, locks_in
 from whitefurnace.files.manifest import read_manifest, write_manifest
 from whitefurnace.files.npy import release, scratch, write_npy
 from whitefurnace.files.npz import write_npz
@@ -22,23 +24,32 @@ from whitefurnace.files.texture import Texture, encode, text_value
 
 __all__ = [
     "EnvMap",
+    "Gltf",
     "GltfLight",
     "Image",
     "ImageFacts",
     "Light",
+    "Lock",
     "Stored",
     "Texture",
     "Transaction",
+    "acquire",
     "check_table",
     "decode_srgb",
     "digest_file",
     "encode",
+    "finish",
     "identifier",
     "image_facts",
     "is_arrays",
     "is_light",
+    "is_lock",
+    "is_safe",
     "is_texture",
     "light_digest",
+    "light_files",
+    "lock_path",
+    "locks_in",
     "number",
     "pack",
     "pack_hdr",
@@ -57,6 +68,7 @@ __all__ = [
     "read_texture",
     "release",
     "scratch",
+    "srgb_table",
     "stored_format",
     "text_value",
     "unpack",

@@ -32,6 +32,8 @@ class Transaction:
         temporary = self.staging(path)
         self._targets.append(path)
         try:
+            # What is there may be a link, or a second name of a file: writing would go through to it.
+            temporary.unlink(missing_ok=True)
             writer(temporary)
             with open(temporary, "rb+") as file:
                 os.fsync(file.fileno())
@@ -42,10 +44,14 @@ class Transaction:
         """Where the staged bytes of `path` are until `commit`."""
         return self.staging(path)
 
-    def commit(self) -> None:
-        """Rename every staged file to its target. Raises `FileError`."""
+    def commit(self, stale: Iterable[Path] = ()) -> None:
+        """Rename every staged file to its target; before the last, the manifest, remove what is `stale`: the manifest
+        that proves it ours is there until then. Raises `FileError`."""
         while self._targets:
             path = self._targets[0]
+            for old in stale if len(self._targets) == 1 else ():
+                with contextlib.suppress(OSError):
+                    old.unlink()
             try:
                 os.replace(self.staging(path), path)
             except OSError as error:

@@ -156,21 +156,22 @@ def _gltf(path: Path) -> Light:
                  (FORMATS["rgbd"].largest,) * 3, facts, roughness=roughness, irradiance_sh=found.coefficients)
 
 
-def light_digest(path: str | os.PathLike[str]) -> str:
-    """sha256 in hex of the file's bytes; of a .gltf whose images or buffers lie beside it of all of their digests.
-    Raises `FileError`."""
+def light_files(path: str | os.PathLike[str]) -> list[Path]:
+    """The file, and of a .gltf the images and buffers that lie beside it too."""
     path = Path(path)
-    own = digest_file(path)
     try:
         document = json.loads(path.read_bytes()) if path.suffix.lower() == ".gltf" else {}
         uris = [entry.get("uri", "data:") for part in ("images", "buffers") for entry in document.get(part, ())]
     except (OSError, ValueError, AttributeError, TypeError, RecursionError):
-        return own
-    beside = [uri for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
-    if not beside:
-        return own
-    parts = [own, *(digest_file(path.parent / unquote(uri)) for uri in beside)]
-    return hashlib.sha256("".join(parts).encode()).hexdigest()
+        return [path]
+    return [path, *(path.parent / unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:"))]
+
+
+def light_digest(path: str | os.PathLike[str]) -> str:
+    """sha256 in hex of the file's bytes; of a .gltf whose images or buffers lie beside it of all of their digests.
+    Raises `FileError`."""
+    parts = [digest_file(file) for file in light_files(path)]
+    return parts[0] if len(parts) == 1 else hashlib.sha256("".join(parts).encode()).hexdigest()
 
 
 def _largest(texture: Texture) -> tuple[float, ...]:

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
 from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction, write_atomic
 
@@ -36,5 +38,7 @@ def write_manifest(path: str | os.PathLike[str], manifest: Mapping[str, Any], *,
     and hold finite numbers only. Raises `FileError` for what cannot be written."""
     if "whitefurnace" not in manifest:
         raise ValueError("a manifest must have the key 'whitefurnace', the version that wrote it")
-    text = json.dumps(manifest, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n"
+    # Python's own indentation is written in Python, at a tenth of the speed.
+    plain = json.dumps(manifest, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    text = msgspec.json.format(plain, indent=2) + "\n"
     write_atomic(path, lambda temporary: temporary.write_bytes(text.encode()), into)

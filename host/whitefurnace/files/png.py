@@ -30,10 +30,10 @@ _PIECE = 1 << 20
 _MAX_RATIO = 1032
 
 
-def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False) -> bytes:
+def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False, effort: int = 9) -> bytes:
     """`pixels` (height, width, 1 | 3 | 4) of 8 or 16 bits as a PNG: the same pixels give the same bytes. There is
     nothing in it but the pixels, and `srgb` says that they are a picture in sRGB: what states no colour space no reader
-    converts."""
+    converts. `effort` of zlib, 1 to 9."""
     pixels = np.ascontiguousarray(pixels)
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or \
             0 in pixels.shape:
@@ -44,7 +44,7 @@ def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False) -> bytes:
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, pixels.dtype.name)
     spec.attribute("oiio:UnassociatedAlpha", 1)
-    spec.attribute("png:compressionLevel", 9)
+    spec.attribute("png:compressionLevel", effort)
     with _scratch_file(".png") as path:
         output = oiio.ImageOutput.create("png")
         done = output is not None and output.open(str(path), spec) and output.write_image(pixels)
@@ -77,7 +77,8 @@ def decode_png(data: Buffer | Source, *, side: int | None = None) -> Pixels:
     return pixels
 
 
-def write_png(path: str | os.PathLike[str], image: npt.ArrayLike, *, into: Transaction | None = None) -> None:
+def write_png(path: str | os.PathLike[str], image: npt.ArrayLike, *, effort: int = 9,
+              into: Transaction | None = None) -> None:
     """Write a picture (height, width, 3 | 4) in sRGB: uint8, or floats of 0 to 1 that are in sRGB already and are
     rounded to the nearest of 255 steps, what is beyond to the ends. Raises `InputError` for NaN, `FileError` for what
     cannot be written."""
@@ -87,7 +88,7 @@ def write_png(path: str | os.PathLike[str], image: npt.ArrayLike, *, into: Trans
         if count := int(np.isnan(values).sum()):
             raise InputError(f"{path}: {count} NaN in a picture, its values must be numbers from 0 to 1")
         array = np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
-    write_pieces(path, [encode_png(array, srgb=True)], into)
+    write_pieces(path, [encode_png(array, srgb=True, effort=effort)], into)
 
 
 def decode_by_oiio(data: bytes, form: str, source: Source) -> Pixels:

@@ -1,0 +1,188 @@
+"""One writer an output: a lock file that the system lets go of when its holder dies, and what such a death leaves."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+import time
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from whitefurnace.errors import FileError
+from whitefurnace.files.atomic import Transaction, digest_file
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+_MOST_BYTES = 1 << 20
+_SUFFIX = ".lock"
+_BEGIN = b'{"whitefurnace"'
+# How long a waiter sleeps between looks: little beside an item, and no load where many wait.
+_FIRST, _LAST = 0.02, 0.5
+
+
+def lock_path(manifest: Path) -> Path:
+    """The lock of the output whose manifest is at `STEM.json`: `.STEM.lock` beside it."""
+    return manifest.with_name(f".{manifest.name.removesuffix('.json')}{_SUFFIX}")
+
+
+def is_safe(relative: Any) -> bool:
+    """Whether a manifest's name of a file stays in its folder: no absolute path, no `..`, no drive."""
+    if not isinstance(relative, str) or not relative or "\\" in relative or ":" in relative.split("/")[0][1:2]:
+        return False
+    path = PurePosixPath(relative)
+    return not path.is_absolute() and ".." not in path.parts
+
+
+class Lock:
+    """A held lock. `left` names what a holder that died may have left staged, `waited` tells that another held it.
+
+    The file is removed while the lock is held; who opened it before finds by its inode that it is no longer the lock.
+    """
+
+    def __init__(self, path: Path, handle: int, left: tuple[str, ...], waited: bool) -> None:
+        self.path, self.left, self.waited = path, left, waited
+        self._handle: int | None = handle
+
+    def note(self, targets: Iterable[Path]) -> None:
+        """Writes down what is about to be staged, for who finds this lock after a death. Raises FileError."""
+        names = sorted({*self.left, *(t.relative_to(self.path.parent).as_posix() for t in targets)})
+        data = json.dumps({"whitefurnace": names}).encode()
+        assert self._handle is not None
+        try:
+            os.lseek(self._handle, 0, os.SEEK_SET)
+            os.ftruncate(self._handle, 0)
+            os.write(self._handle, data)
+        except OSError as error:
+            raise FileError(f"cannot write {self.path}: {error.strerror or error}") from error
+
+    def sweep(self, keep: Collection[Path] = ()) -> None:
+        """Removes what a dead holder left staged, but for `keep`."""
+        for name in self.left:
+            staged = Transaction.staging(self.path.parent / name)
+            if is_safe(name) and staged not in keep and staged.is_file() and not staged.is_symlink():
+                with contextlib.suppress(OSError):
+                    staged.unlink()
+
+    def release(self) -> None:
+        """Removes the file and lets go; again it does nothing."""
+        if self._handle is None:
+            return
+        handle, self._handle = self._handle, None
+        if sys.platform != "win32":  # there an open file stays
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+        os.close(handle)
+        if sys.platform == "win32":
+            with contextlib.suppress(OSError):  # open elsewhere: it is theirs now
+                self.path.unlink()
+
+
+def acquire(path: Path, *, wait: bool = True, folder: bool = False) -> Lock | None:
+    """The lock at `path`; None where another has it and `wait` is false. `folder`: make its folder where it is missing.
+    Raises FileError where it cannot be made, or is a file that is not ours."""
+    pause, waited, missing = _FIRST, False, 0
+    while True:
+        try:
+            if folder:
+                path.parent.mkdir(parents=True, exist_ok=True)
+            # Not through a symbolic link: what is written would land where it points.
+            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+                             | getattr(os, "O_NONBLOCK", 0), 0o666)
+        except FileNotFoundError as error:  # a run that failed removed the empty folder just now
+            missing += 1
+            if not folder or missing == 10:
+                raise FileError(f"cannot write into {path.parent}: {error.strerror or error}") from error
+            continue
+        except OSError as error:
+            raise FileError(f"cannot write into {path.parent}: {error.strerror or error}") from error
+        try:
+            if _try(handle) and _same(handle, path):
+                return Lock(path, handle, _left(path, handle), waited)
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+        if not wait:
+            return None
+        waited = True
+        time.sleep(pause)
+        pause = min(2 * pause, _LAST)
+
+
+def _try(handle: int) -> bool:
+    try:
+        if sys.platform == "win32":
+            os.lseek(handle, 1 << 30, os.SEEK_SET)  # beyond what is written: a locked byte cannot be read
+            msvcrt.locking(handle, msvcrt.LK_NBLCK, 1)
+        else:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    return True
+
+
+def _same(handle: int, path: Path) -> bool:
+    """Whether the open file is still the one of that name."""
+    try:
+        return os.path.samestat(os.fstat(handle), os.stat(path, follow_symlinks=False))
+    except FileNotFoundError:
+        return False
+
+
+def _left(path: Path, handle: int) -> tuple[str, ...]:
+    os.lseek(handle, 0, os.SEEK_SET)
+    data = os.read(handle, _MOST_BYTES)
+    if not data:
+        return ()
+    try:
+        names = json.loads(data)["whitefurnace"]
+        return tuple(name for name in names if is_safe(name))
+    except (ValueError, LookupError, TypeError, RecursionError):
+        # A death while it was written leaves its beginning.
+        if data.startswith(_BEGIN):
+            return ()
+        raise FileError(f"{path} is there and is not our lock; move it away") from None
+
+
+def finish(manifest: Path, files: Mapping[str, Any],
+           ours: Mapping[str, Collection[Any]]) -> list[tuple[Path, Path]] | None:
+    """The renames that complete what a death between renames left: of each of `files`, named relative to the manifest's
+    folder with their sha256, that is still staged, and of the manifest itself. None where one is neither staged nor
+    there, or would replace a file that is none of `ours`."""
+    renames = []
+    for relative, digest in files.items():
+        target = manifest.parent / relative
+        staged = Transaction.staging(target)
+        there = digest_file(target) if target.is_file() and not target.is_symlink() else None
+        if there == digest:
+            continue
+        if not (staged.is_file() and not staged.is_symlink() and digest_file(staged) == digest):
+            return None
+        if os.path.lexists(target) and there not in ours.get(relative, ()):
+            return None
+        renames.append((staged, target))
+    return [*renames, (Transaction.staging(manifest), manifest)]
+
+
+def is_lock(path: Path) -> bool:
+    """Whether a file is one of our locks, by what a holder noted in it."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(_BEGIN)) == _BEGIN
+    except OSError:
+        return False
+
+
+def locks_in(folder: Path) -> list[Path]:
+    """The lock files in a folder."""
+    try:
+        with os.scandir(folder) as entries:
+            return sorted(folder / e.name for e in entries if e.name.startswith(".") and e.name.endswith(_SUFFIX))
+    except OSError:
+        return []
