@@ -54,8 +54,8 @@ def test_the_wheel_has_all_files_and_no_others():
         return {path.relative_to(folder).as_posix(): path.read_bytes()
                 for path in folder.rglob("*") if path.suffix in suffixes and "__pycache__" not in path.parts}
 
-    wanted = files(HOST, ".py") | {f"kernels/{name}": text
+    wanted = files(HOST, ".py", ".html") | {f"kernels/{name}": text
                                    for name, text in files(KERNELS, ".py", ".cl", ".clh").items()}
-    there = files(INSTALLED, ".py", ".cl", ".clh")
+    there = files(INSTALLED, ".py", ".html", ".cl", ".clh")
     assert set(there) == set(wanted)
     assert [name for name in wanted if there[name] != wanted[name]] == [], "an old wheel is installed"
