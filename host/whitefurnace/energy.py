@@ -56,6 +56,7 @@ class Kind:
     axes_of: Callable[[Mapping[str, Chosen]], Mapping[str, tuple[float, float, int, str]]] | None = None
     channels: int = 2
     size: int | None = None  # where it is not that of all tables
+    demand: Callable[[str | None, Mapping[str, Any]], Demand] | None = None  # where it is of no BRDF, and in numpy
     fitted: bool = False  # a fit by itself, over x = roughness and y = √(1 - NoV), whose `make` takes their `middle`s
 
     def scheme_of(self, given: str | None) -> str | None:
@@ -63,7 +64,7 @@ class Kind:
         if given is None or (self.schemes and given in self.schemes):
             return given or (self.schemes[0] if self.schemes else None)
         if not self.schemes:
-            raise UsageError(f"{self.name} has no scheme; energy, glass and ltc have")
+            raise UsageError(f"{self.name} has no scheme; energy, glass, ltc and diffusion have")
         raise UsageError(f"unknown scheme {given!r}{nearest(given, self.schemes)}")
 
     def integral(self, scheme: str | None) -> str:
