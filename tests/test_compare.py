@@ -187,6 +187,22 @@ def test_a_file_of_a_preset_is_turned_back_by_itself(tmp_path):
     assert compare(contents(path), contents(tmp_path / "b.npz"), axes_a="+x +y +z").rows[0].worst > 0.1
 
 
+def test_a_file_of_a_users_engine_is_turned_back_as_its_manifest_says(tmp_path):
+    raw(tmp_path / "b.npz", chain())
+    path = tmp_path / "mine" / "a.ktx"
+    path.parent.mkdir()
+    turned = chain(axes_of("+x +z -y").astype(int).tolist())
+    # The key says whose it is, the manifest in which axes that has them.
+    write_texture(path, encode("rgba32f", turned, cube=True, key_values={"whitefurnace:engine": b"mine\0"}).texture)
+    for axes, fits in (("+x +z -y", True), ("+x +y +z", False), ("sideways", False), (3, False)):
+        write_manifest(tmp_path / "a.json", {
+            "whitefurnace": "1", "name": "a", "recipe": {"engines": {"mine": {"engine": {"axes": axes}}}},
+            "files": {"mine/a.ktx": {"sha256": digest_file(path)}}})
+        found = compare(contents(path), contents(tmp_path / "b.npz"))
+        assert (max(row.worst for row in found.rows) < 3e-7) == fits, axes
+        assert any("written for mine" in notice for notice in found.notices) == fits
+
+
 # --- what goes with what --------------------------------------------------------------------------------
 
 

@@ -162,7 +162,7 @@ def test_a_manifest_proves_a_file_whole_or_not(tmp_path):
     write_manifest(tmp_path / "day_1.json", {"whitefurnace": "1", "name": "day_1", "key": "abcdef0123456789",
                                              "files": {"three/day_1.dds": entry}, "recipe": {"size": 8}})
     found = contents(path)
-    assert found.statement.whole and found.engine == "three"
+    assert found.statement.whole and found.written_for == ("three", "-x +y +z")
     assert [level.roughness for level in found.levels] == [0.0, 1.0]
     assert found.levels[0].stated == {"error": 1e-4, "format_p99": 2e-4}
     assert "the digests match" in shown(path) and "key abcdef012345…" in shown(path)
@@ -212,7 +212,8 @@ def test_a_header_is_its_array_and_a_texture_without_its_manifest_says_what_it_c
         "whitefurnace:engine": text_value("bevy"), "whitefurnace:key": text_value("abcdef"),
         "whitefurnace:error": text_value("1e-4 2e-4 3e-4 4e-4"), "whitefurnace:manifest": text_value("mine")})
     found = contents(path)
-    assert found.engine == "bevy" and found.statement.manifest is None and found.statement.whole is None
+    assert found.written_for == ("bevy", "+x +y -z")
+    assert found.statement.manifest is None and found.statement.whole is None
     assert [level.stated["error"] for level in found.levels] == [1e-4, 2e-4, 3e-4, 4e-4]
     assert described(found)["statement"]["manifest"] is None and "for bevy" in shown(path)
 

@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 
 from reference import cube_directions
-from whitefurnace import bake, dfg, harmonic, octamap
+from whitefurnace import bake, dfg, harmonic, octamap, report
 from whitefurnace.cli import main
-from whitefurnace.engines import ENGINES, FORMATS, as_text, axes_matrix, engines, user_engine
+from whitefurnace.engines import ENGINES, FORMATS, Dfg, Engine, File, as_text, axes_matrix, engines, user_engine
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.expression import LANGUAGES, Expression, table_text
-from whitefurnace.files import read_env, read_gltf_lights, read_image, read_texture
+from whitefurnace.files import encode, read_env, read_gltf_lights, read_image, read_texture
 from whitefurnace.files.packing import step
+from whitefurnace.outputs import targets
 from whitefurnace.recipe import LOD_NAMES, Lods, chain
 from whitefurnace.sphere import turned_cube
 from whitefurnace.split_sum import split_sum
@@ -47,7 +48,7 @@ def test_a_formula_is_what_it_says(text, value):
 @pytest.mark.parametrize("text", [
     "__import__('os').system('x')", "r.real", "r[0]", "lambda: r", "rr", "2 **", "True", "r if r else 1", "sqrt(1, 2)",
     "'a'", "1e999", "(" * 300 + "r" + ")" * 300, "", "r" * 2000, "+".join(["r"] * 300), "[r]", "r < 1", "f(r)", "1j",
-    "r; r", "r\nr", "x := r", "max(*r, 1)", "max(r, b=1)",
+    "r; r", "r\nr", "x := r", "max(*r, 1)", "max(r, b=1)", "1" + "0" * 400,
 ])
 def test_what_is_no_formula_is_one_sentence(text):
     with pytest.raises(UsageError) as told:
@@ -260,6 +261,27 @@ def test_charlie_and_coverage(tmp_path, device):
     assert np.abs(sheen - ggx).max() > 0.02
 
 
+def test_sheen_on_a_hard_panel_is_baked_and_says_what_it_reached(tmp_path, device):
+    """Charlie's smooth lobes are a rim at the horizon: with a panel there they do not reach 1e-3 on any grid."""
+    image = np.full((128, 256, 3), 0.1, np.float32)
+    image[48:80, 60:100] = 20
+    (made,) = bake(image, tmp_path, for_="khronos", size=32, device=device)
+    rows = {name: [row for row in made.levels if row.get("ndf", "ggx") == name] for name in ("ggx", "charlie")}
+    assert [row["roughness"] for row in rows["ggx"]] == pytest.approx([0, 1 / 3, 2 / 3, 1])
+    assert [row["roughness"] for row in rows["charlie"]] == pytest.approx([1 / 3, 2 / 3, 1])  # level 0 is the same
+    assert max(row["error"] for row in rows["ggx"]) <= 1e-3 and max(row["error"] for row in rows["charlie"]) <= 1e-2
+    text = report.baked_text(made, tmp_path)
+    assert "specular 3" in text and "specular 4" not in text and "sheen 3" in text
+
+
+@pytest.mark.parametrize(("name", "size"), [("unity", 16), ("godot", 8), ("bevy", 2), ("filament", 4), ("three", 1)])
+def test_small_probes_have_the_levels_they_can_have(tmp_path, device, name, size):
+    (made,) = bake(coded(16), tmp_path, for_=name, size=size, device=device)
+    assert made.state == "done"
+    with pytest.raises(UsageError, match=f"{name}: min-size"):
+        bake(coded(16), tmp_path, for_=name, size=size, min_size=2 * size)
+
+
 def test_files_are_no_larger_than_they_need_be(tmp_path, device):
     bake(coded(256), tmp_path, for_="filament,bevy,babylon,unity,three", size=128, device=device)
     texels = 6 * sum(s * s for s in (128, 64, 32, 16, 8))
@@ -407,6 +429,24 @@ format = "rgba32f"
 layout = "octahedral"
 border = 0
 """
+
+
+def test_a_border_wider_than_the_last_level_is_refused_before_anything_is_made(tmp_path):
+    (tmp_path / "square.toml").write_text(SQUARE)
+    with pytest.raises(UsageError, match=r"border of 2 texels does not go around the last level's 1²"):
+        bake(coded(), tmp_path, for_=str(tmp_path / "square.toml"), min_size=1, dry_run=True)
+
+
+@pytest.mark.parametrize(("suffix", "form"), [(s, f) for s in (".ktx2", ".dds") for f in FORMATS[s]])
+def test_a_dry_run_knows_the_bytes_of_every_format(suffix, form):
+    """Those that the encoder makes, of a table that is no multiple of a block."""
+    if form == "bc6hu":
+        pytest.importorskip("ispc_texcomp")
+    if form == "astc4x4hdr":
+        pytest.importorskip("astc_encoder")
+    (target,) = targets(Engine("x", file=(File("dfg", "{stem}" + suffix, form),), dfg=Dfg(7)), chain(), Path("."), "a")
+    made = encode(form, [np.full((7, 7, 2 if form == "rg16f" else 3), 0.5, np.float32)]).texture
+    assert target.nbytes == sum(memoryview(level).nbytes for level in made.levels)
 
 
 def test_octahedral_maps(tmp_path, device):

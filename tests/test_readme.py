@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from scenes import helmet
 from whitefurnace.engines import user_engine
 from whitefurnace.environments import LAYOUTS
 from whitefurnace.files import write_exr
@@ -39,6 +40,11 @@ def folder(tmp_path_factory) -> Path:
     for name in ("studio.hdr", "day.exr", "night.exr", "forest_1k.exr"):
         write_exr(where / name, rng.random((16, 32, 3), np.float32))
     (where / "my_engine.toml").write_text(blocks("toml")[0])
+    (where / "probes").mkdir()
+    for k in range(2):
+        write_exr(where / "probes" / f"p{k}.exr", rng.random((16, 32, 3), np.float32))
+    (where / "probes.toml").write_text(next(block for block in blocks("toml") if "[[bake]]" in block))
+    helmet(where / "helmet.glb")
     for block in blocks("c"):
         name = re.search(r"(?:ndf|brdf)_(\w+)_[Df]\(", block)
         assert name, block
@@ -88,6 +94,12 @@ def test_the_engine_of_the_readme_is_one(folder):
     assert done.returncode == 0, done.stderr
 
 
+def test_the_scene_of_the_readme_is_what_the_program_says(folder):
+    said = run("scene", "helmet.glb", cwd=folder).stdout
+    written = README.partition("<!-- scene:")[2].partition("```\n")[2].partition("```")[0]
+    assert written.strip("\n") == said.strip("\n")
+
+
 def test_the_table_of_layouts_names_every_layout():
     table = README.partition("| layout | aspect |")[2].partition("\n\n")[0]
     for layout in LAYOUTS:
@@ -96,7 +108,8 @@ def test_the_table_of_layouts_names_every_layout():
 
 def test_the_options_of_the_readme_exist():
     told = "".join(run(command, "--help").stdout for command in ("bake", "lut", "verify", "bench", "models", "devices",
-                                                                   "inspect", "compare", "render", "engines"))
+                                                                   "inspect", "compare", "render", "engines", "batch",
+                                                                   "scene"))
     for option in set(re.findall(r"`(--[a-z-]+)", README)):
         assert option in told, option
 

@@ -36,7 +36,7 @@ from whitefurnace.lighting import Filtered, Lighting, Want, light
 from whitefurnace.outputs import Made, Target, targets
 from whitefurnace.plan import LevelPlan, plan_chain
 from whitefurnace.reading import Reader, compared
-from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, Chosen, chain, chosen
+from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, TOLERANCE_RANGE, Chain, Chosen, chain, chosen, is_number
 from whitefurnace.run import Integrated, dfg
 from whitefurnace.sphere import Shape
 from whitefurnace.split_sum import SplitSum, split_sum
@@ -48,6 +48,9 @@ DEMO_HEIGHT = 512
 SUN_RADIUS = math.radians(0.2665)  # of the sun as seen from the earth
 SUN_RADIANCE = 4e5
 DFG_TOLERANCE = 5e-6
+SHEEN = 10
+"""How many times the tolerance Charlie's levels are allowed: a sheen reflects a tenth of what GGX does, and where its
+smooth lobes are a rim at the horizon, hard panels do not reach 1e-3 on any grid."""
 
 
 def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
@@ -161,9 +164,16 @@ def _chain(engine: Engine, options: Mapping[str, Any]) -> Chain:
     if "only_levels" in given and engine.container == "files":
         raise UsageError(f"{engine.name} has all levels as mips of one texture: only-levels is of raw and exr")
     given.setdefault("size", engine.size)
-    if engine.levels and not {"min_size", "levels"} & set(given):
-        given["levels"] = engine.levels
-    return chain(lods=engine.lods, usual_min=engine.min_size, **given)
+    usual = engine.min_size
+    if engine.container == "files" and is_number(given["size"]) and given["size"] >= 1:
+        # A small probe has the levels that it can have.
+        usual = min(usual, given["size"])
+        if engine.levels and not {"min_size", "levels"} & set(given):
+            given["levels"] = min(engine.levels, int(given["size"]).bit_length())
+    try:
+        return chain(lods=engine.lods, usual_min=usual, **given)
+    except UsageError as error:
+        raise error if engine.container != "files" else UsageError(f"{engine.name}: {error}") from None
 
 
 def _is_demo(item: Any) -> bool:
@@ -508,7 +518,9 @@ def _wanted(request: Order) -> tuple[list[Want], list[tuple[int, int]]]:
         own = Want(recipe, None if engine.cubes("specular") else 0,
                    None if engine.latlong else min(len(engine.holding("environment")), 1),
                    None if engine.octahedral else 0)
-        sheen = Want(replace(recipe, ndf=chosen("ndf", "charlie"), fit=None), None if engine.holding("sheen") else 0)
+        sheen = Want(replace(recipe, ndf=chosen("ndf", "charlie"), fit=None,
+                             tolerance=min(SHEEN * recipe.tolerance, TOLERANCE_RANGE[1])),
+                     None if engine.holding("sheen") else 0)
         for want in (own, sheen):
             place = next((k for k, other in enumerate(wants) if other.recipe == want.recipe), len(wants))
             if place == len(wants):
@@ -541,8 +553,9 @@ def _rows_of(request: Order, lit: Lighting, of: Sequence[tuple[int, int]],
             levels = getattr(chain_, what)
             kept = chain_.energy_kept if what == "levels" else [None] * len(levels)
             for level, k in zip(levels, kept, strict=True):
-                names = found[id(level)][3] if id(level) in found else ()
-                found[id(level)] = (level, k, ndf, names if engine.name in names else (*names, engine.name))
+                old = found.get(id(level), (level, k, ndf, ()))  # level 0 is of every NDF
+                names = old[3] if engine.name in old[3] else (*old[3], engine.name)
+                found[id(level)] = (level, k, old[2], names)
     # From large to small and smooth to rough: each engine's are then in the order of its levels.
     return sorted(found.values(), key=lambda row: (row[2] == "charlie", -row[0].texels.shape[-2], row[0].roughness))
 

@@ -66,6 +66,11 @@ def cli(context: click.Context) -> None:
 @click.option("--sh", metavar="window=auto|none|X", default="window=auto", show_default=True,
               help="Window of an engine's irradiance harmonics: the least that keeps them from going negative, none, "
                    "or sinc⁴ with its cutoff at degree X.")
+@click.option("--without", metavar="LIST", default="",
+              help="Of irradiance, sh, sheen, dfg, skybox, what no material reads; `whitefurnace scene` tells.")
+@click.option("--only-levels", metavar="A-B", help="Of raw and exr, the levels that are made, counted from 0.")
+@click.option("--table", metavar="N", type=int,
+              help="Texels a side of engines' split-sum tables. [default: as they want]")
 @click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done and written, and do nothing.")
 @click.option("--force", is_flag=True, help="Bake again, and replace files that are not known to be ours.")
@@ -120,6 +125,7 @@ Examples:
   whitefurnace lut ltc -o ltc.npy
   whitefurnace lut glass -o glass.ktx2 --size 32
   whitefurnace lut smith -o smith.h --ndf abc:c=1.5
+  whitefurnace lut diffusion -o skin.png --size 256
   whitefurnace lut albedo -o gold.exr --fresnel schlick:gold --size 64x32
   whitefurnace lut albedo -o sheen.npy --ndf charlie --axis alpha=.01:1:64:log --tolerance 1e-4
   whitefurnace lut albedo_average -o average.npy --fresnel schlick --axis f0=0:1:32
@@ -155,7 +161,8 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device o
 @click.option("--scheme", metavar="NAME",
               help="Of dfg: scale_bias (the default), multiscatter; of energy: kulla_conty (the default), turquin, "
                    "fdez_aguera; of ltc: free (the default), heitz; of "
-                   "glass: entering (the default), leaving; of smith: rational (the default), linear.")
+                   "glass: entering (the default), leaving; of smith: rational (the default), linear; of diffusion: "
+                   "skin (the default), burley, dipole, or a medium, as marble.")
 @click.option("--ndf", metavar="NAME[:p=v,...]", help="Or FILE.clh. [default: ggx, without a --diffuse or --brdf]")
 @click.option("--masking", metavar="NAME", help="[default: smith]")
 @click.option("--fresnel", metavar="NAME[:p=v,...]", help="Or NAME:PRESET, as schlick:gold. [default: one]")
@@ -181,7 +188,8 @@ def lut(kind: str, output: Path, axes: tuple[str, ...], fixed: tuple[str, ...], 
 
     KIND is normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance; energy, which is
     what multiple scattering gives back; sheen, with what it leaves to the layer under it; fresnel_average;
-    glass, what a rough boundary reflects and lets through; smith and norm, coefficients of simpler curves; or
+    glass, what a rough boundary reflects and lets through; smith and norm, coefficients of simpler curves;
+    diffusion, diffuse light on skin and other media by curvature, over NoL and 1/radius in 1/mm; or
     ltc, linearly transformed cosines for polygonal lights (ltc_1 and ltc_2 are one each of its two textures).
     """
     from whitefurnace import report, tables
@@ -206,9 +214,9 @@ Examples:
   whitefurnace batch probes.toml --shard 2/8 --depfile probes.2.d
 
 \b
-JOB is a TOML file of tables [[bake]] and [[lut]]. A [[bake]] has `environments`, a list of paths and patterns (* ? [...]
-and **), `output`, a folder, `for`, a list, and the options of `whitefurnace bake` under their names; a [[lut]] has
-`kind`, `output`, a file, and those of `whitefurnace lut`, `axis` and `set` as lists. Paths are relative to JOB.
+JOB is a TOML file of tables [[bake]] and [[lut]]. A [[bake]] has `environments`, a list of paths and patterns (*, ?,
+[...] and **), `output`, a folder, `for`, a list, and the options of `whitefurnace bake` under their names; a [[lut]]
+has `kind`, `output`, a file, and those of `whitefurnace lut`, `axis` and `set` as lists. Paths are relative to JOB.
 All of it is checked before anything runs. What is there and whole is not made again, whoever made it, so a batch that
 was stopped goes on where it was.
 
@@ -230,6 +238,8 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input (the job to
 @click.option("--shard", metavar="I/N", help="Every N-th item from the I-th on; the N shards are the whole.")
 @click.option("--depfile", metavar="FILE", type=click.Path(path_type=Path),
               help="Write what was made, and from what, as Makefile rules.")
+@click.option("--report", "page", metavar="DIR", type=click.Path(path_type=Path),
+              help="Write DIR/index.html: a row an item with pictures of its levels, errors, time and size.")
 @click.option("--allow-kernels", is_flag=True, help="Let the job name .clh files, whose text the device runs.")
 @click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
 @click.option("--dry-run", is_flag=True, help="Say what would be done and written, and do nothing.")
@@ -237,19 +247,19 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input (the job to
 @click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
 @click.option("--quiet", is_flag=True, help="Print failures only.")
 def batch(job: Path, root: Path | None, workers: int, scheduler: str | None, send: bool, shard: str | None,
-          depfile: Path | None, allow_kernels: bool, device: str | None, dry_run: bool, force: bool, as_json: bool,
-          quiet: bool) -> None:
+          depfile: Path | None, page: Path | None, allow_kernels: bool, device: str | None, dry_run: bool, force: bool,
+          as_json: bool, quiet: bool) -> None:
     """Do many bakes and tables of a job file, each once: what is whole already is skipped."""
     from whitefurnace import batch as batching
     from whitefurnace import errors, report
 
-    part = report.shard(shard) if shard is not None else None
+    part = batching.shard_of(shard) if shard is not None else None
     if send and scheduler is None:
         raise errors.UsageError("--send sends sources to a --scheduler's cluster, and none is given")
     made = batching.job(job, root=root, allow_kernels=allow_kernels, force=force, device=device, send=send)
     if part:
         made = made.shard(*part)
-    tally = report.Tally(len(made.items))
+    tally = batching.Tally(len(made.items))
     results = []
 
     def tell(result: Any) -> None:
@@ -262,33 +272,54 @@ def batch(job: Path, root: Path | None, workers: int, scheduler: str | None, sen
             click.echo(line)
         for notice in () if quiet else result.notices:
             _say(f"notice: {result.place}: {notice}")
-        if result.state == "failed":
-            _say(f"error: {result.place}: {result.message}")
-
-    begin = tally.begin
     try:
         if dry_run:
             for result in made.predicted():
                 tell(result)
         else:
-            with _batch_progress(tally, not (quiet or as_json)) as show:
-                batching.run(made, workers=workers, scheduler=scheduler,
-                             on_result=lambda result: (tell(result), show())[1],
+            told = _json if as_json else None if quiet else lambda row: click.echo(f"report: {row['file']}")
+            with _batch_page(page, job.name, force, tally, told) as add, \
+                    _batch_progress(tally, not (quiet or as_json)) as show:
+                def on_result(result: batching.Result) -> None:
+                    tell(result)
+                    add(result)
+                    show()
+
+                batching.run(made, workers=workers, scheduler=scheduler, on_result=on_result,
                              on_notice=None if quiet else lambda text: _say(f"notice: {text}"))
         if depfile is not None and not dry_run:
             batching.depfile(made, results, depfile)
     finally:
         if as_json:
-            _json(tally.row(begin))
+            _json(report.tally_row(tally))
         else:
-            for line in tally.failures():
+            for line in report.failures_text(tally):
                 _say(line)
             if not quiet:
-                click.echo(tally.text())
+                click.echo(report.tally_text(tally))
     if tally.failed:
         codes = {result.exit_code for result in tally.failed}
         kind = errors.of_code(codes.pop()) if len(codes) == 1 and len(tally.failed) == tally.total else None
         raise (kind or errors.PartialError)(f"{len(tally.failed)} of {tally.total} items failed")
+
+
+@contextlib.contextmanager
+def _batch_page(folder: Path | None, title: str, force: bool, tally: Any,
+                tell: Callable[[dict[str, Any]], None] | None) -> Iterator[Callable[[Any], None]]:
+    """The page of a batch, which is written of what ended when it is stopped too."""
+    if folder is None:
+        yield lambda result: None
+        return
+    from whitefurnace.gallery import Gallery
+
+    with Gallery(folder, title=title, force=force) as page:
+        try:
+            yield page.add
+        finally:
+            if tally.count:  # else the page of an earlier run stays
+                path = page.close(total=tally.total)
+                if tell is not None:
+                    tell({"event": "report", "file": str(path)})
 
 
 @contextlib.contextmanager
@@ -300,10 +331,103 @@ def _batch_progress(tally: Any, wanted: bool) -> Iterator[Callable[[], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    from whitefurnace import report
+
     columns = (MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn(compact=True))
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("", total=tally.total)
-        yield lambda: bar.update(task, completed=tally.count, description=tally.rate_text())
+        yield lambda: bar.update(task, completed=tally.count, description=report.rate_text(tally))
+
+
+EPILOG_SCENE = """\b
+Examples:
+  whitefurnace scene helmet.glb
+  whitefurnace scene helmet.glb --for filament --environment studio.hdr -o baked
+  whitefurnace scene helmet.glb --for three --environment 'probes/*.exr' --job helmet.toml
+
+\b
+FILE's materials are read with their extensions and textures: the range of each value over what the scene's triangles
+use of an image. What of ENGINE's usual bake they need is listed, and what not, each with its reason; `cannot` is what
+no table of an environment gives. -o bakes it; --job writes a job for `whitefurnace batch`.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported (without
+pygltflib), 7 a tolerance was missed, 130 interrupted.
+"""
+
+
+@cli.command(epilog=EPILOG_SCENE)
+@click.argument("file", type=click.Path(path_type=Path))
+@click.option("--for", "for_", metavar="ENGINE", default="raw", show_default=True, help="Who loads it, or FILE.toml.")
+@click.option("--environment", "environments", metavar="ENV", multiple=True, help="What lights it; may be repeated.")
+@click.option("-o", "--output", metavar="DIR", type=click.Path(path_type=Path), help="Bake what is needed into DIR.")
+@click.option("--job", metavar="JOB.toml", type=click.Path(path_type=Path),
+              help="Write what is needed as a job for `whitefurnace batch`.")
+@click.option("--background", is_flag=True, help="The environment itself is seen behind the scene.")
+@click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
+@click.option("--force", is_flag=True, help="Bake again, and replace files that are not known to be ours.")
+@click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
+@click.option("--quiet", is_flag=True, help="Print errors only.")
+def scene(file: Path, for_: str, environments: tuple[str, ...], output: Path | None, job: Path | None,
+          background: bool, device: str | None, force: bool, as_json: bool, quiet: bool) -> None:
+    """Say what of a bake the materials of a glTF scene need, bake just that, and what it saves."""
+    from whitefurnace import needs as deciding
+    from whitefurnace import report
+    from whitefurnace import scene as reading
+    from whitefurnace.engines import engines as named
+    from whitefurnace.errors import UsageError
+
+    if output is not None and job is not None:
+        raise UsageError("give -o or --job, not both")
+    if (output or job) and not environments:
+        raise UsageError(f"{'-o' if output else '--job'} bakes an environment: give --environment ENV")
+    engine = deciding.one_engine(named(for_))
+    found = reading.read_scene(file)
+    needs = deciding.needs(found, engine, background=background)
+    for notice in () if quiet else found.notices:
+        _say(f"notice: {file.name}: {notice}")
+    for row in report.scene_rows(found, needs) if as_json else ():
+        _json(row)
+    if not as_json and not quiet:
+        click.echo(report.scene_text(found, needs))
+    if needs.own is None:
+        return
+    if job is not None:
+        deciding.write_job(job, needs, for_, file.name, environments, force=force)
+        if as_json:
+            _json({"event": "job", "file": str(job)})
+        elif not quiet:
+            click.echo(f"  wrote {job}")
+    if output is not None:
+        _bake_needs(needs, for_, environments, output, device, force, as_json, quiet)
+
+
+def _bake_needs(needs: Any, for_: str, environments: tuple[str, ...], output: Path, device: str | None, force: bool,
+                as_json: bool, quiet: bool) -> None:
+    from whitefurnace import baking, report, tables
+    from whitefurnace import needs as deciding
+
+    orders = [(Path(folder), baking.order(environments, folder, for_=for_, force=force, **options))
+              for one in deciding.bakes(needs, str(output)) for folder, options in [(one.pop("output"), one)]]
+    with _progress(not (quiet or as_json)) as tell:
+        for folder, order in orders:
+            for k, name in enumerate(order.names):
+                baked = baking.bake_one(order, k, device, progress=tell)
+                for notice in () if quiet else baked.notices:
+                    _say(f"notice: {name}: {notice}")
+                for row in report.baked_rows(baked) if as_json else ():
+                    _json(row)
+                if not as_json and not quiet:
+                    click.echo(report.baked_text(baked, folder))
+        for one in needs.tables:
+            options = {key: value for key, value in one.items() if key not in ("kind", "output", "set")}
+            request = tables.order(one["kind"], output / one["output"], force=force,
+                                   parameters=tables.named("--set", one.get("set", [])), **options)
+            made = tables.make(request, device, progress=tell)
+            if as_json:
+                _json(report.table_row(made))
+            elif not quiet:
+                click.echo(report.table_text(made))
 
 
 EPILOG_VERIFY = """\b
@@ -518,6 +642,8 @@ Examples:
   whitefurnace bake demo -o baked --for filament,three --size 64
   whitefurnace render baked/demo.json --for filament -o grid.png
   whitefurnace render baked/demo.json --for three -o gold.png --base-color 1 .78 .34 --rows 1 --exposure -1
+  whitefurnace render baked/demo.json --for filament -o beside.png --truth demo --multiscatter
+  whitefurnace render baked/demo.json --for filament -o layers.exr --truth demo --light punctual:NoL=.5,color=2
 
 \b
 MANIFEST is the STEM.json of a bake. Roughness goes from 0 to 1 across, metalness from 0 to 1 down (one row: 1). The
@@ -525,14 +651,21 @@ spheres are seen in parallel along -z with +y up; behind them is level 0, as a c
 is in sRGB: radiance times 2^exposure, clipped at 1, without a tone curve.
 
 \b
-Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 5 not supported (an engine that is given no
-prefiltered chain), 130 interrupted.
+With --truth, the image that the bake was made of, there are three panels: what the engine shows, the full reflectance
+integral of the same pixels, and their difference over the truth. An .exr holds them as layers of float32, in linear
+radiance. A light's place and directions are in the frame of the viewer (+z to the viewer, +x right), in radii of a
+sphere about its middle; lights are added to both pictures alike.
+
+\b
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported (an engine that
+is given no prefiltered chain), 130 interrupted.
 """
 
 
 @cli.command(epilog=EPILOG_RENDER)
 @click.argument("manifest", type=click.Path(path_type=Path))
-@click.option("-o", "--output", metavar="FILE.png", required=True, type=click.Path(path_type=Path), help="The picture.")
+@click.option("-o", "--output", metavar="FILE", required=True, type=click.Path(path_type=Path),
+              help="The picture: .png, or .exr of the layers with --truth.")
 @click.option("--for", "for_", metavar="ENGINE", required=True,
               help="Whose files are read, and who is followed in how they are shaded: one that the bake was for.")
 @click.option("--size", type=int, default=128, show_default=True, help="Pixels a sphere's cell, 8 to 2048.")
@@ -541,19 +674,49 @@ prefiltered chain), 130 interrupted.
 @click.option("--base-color", metavar="R G B", type=float, nargs=3, default=(1.0, 1.0, 1.0), help="[default: 1 1 1]")
 @click.option("--background", metavar="environment|plain", default="environment", show_default=True)
 @click.option("--exposure", metavar="EV", type=float, default=0.0, help="Multiply radiance by 2^EV.")
-@click.option("--force", is_flag=True, help="Replace FILE.png where it is there.")
+@click.option("--truth", metavar="ENV", help="The image of the bake: draw the full integral beside it.")
+@click.option("--tolerance", metavar="X", type=float,
+              help="Of the truth: the 99th percentile of relative errors, by which samples are chosen. [default: 1e-2]")
+@click.option("--certify", metavar="N", type=int,
+              help="Pixels of each column of the truth that are held against a quadrature in float64. [default: 1]")
+@click.option("--multiscatter", is_flag=True, help="Give the truth what facets lose that scatter once, by scale.")
+@click.option("--ndf", metavar="NAME[:p=v,...]", help="Of the truth. [default: the bake's]")
+@click.option("--dielectric", metavar="NAME[:p=v,...]", help="Fresnel of metalness 0. [default: schlick:f0=.04]")
+@click.option("--metal", metavar="NAME[:p=v,...]", help="Of metalness 1, as schlick:gold. [default: Schlick's of the "
+                                                        "base color]")
+@click.option("--diffuse", metavar="NAME[:p=v,...]", help="As oren_nayar:sigma=.5. [default: lambert]")
+@click.option("--light", metavar="NAME[:p=v,...]", multiple=True,
+              help="Besides the environment: punctual, ambient, disc or rectangle.")
+@click.option("--device", metavar="NAME", help="Of the truth: a number or part of a name from `whitefurnace devices`.")
+@click.option("--force", is_flag=True, help="Replace FILE where it is there.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON row on stdout.")
-def render(manifest: Path, output: Path, as_json: bool, **options: Any) -> None:
-    """Draw a grid of spheres from the files that a bake made for an engine, shaded as that engine does."""
+def render(manifest: Path, output: Path, truth: str | None, as_json: bool, **options: Any) -> None:
+    """Draw a grid of spheres from the files that a bake made for an engine, shaded as that engine does, and beside it
+    the truth."""
     from whitefurnace import rendering, report
+    from whitefurnace.errors import UsageError
 
-    made = rendering.render(manifest, output, **options)
+    own: dict[str, Any] = {name: options.pop(name) for name in (
+        "tolerance", "certify", "multiscatter", "ndf", "dielectric", "metal", "diffuse", "light", "device")}
+    own = {name: value for name, value in own.items() if value is not None and value is not False and value != ()}
+    if truth is None:
+        if own:
+            raise UsageError(f"--{next(iter(own))} is of the truth: give the image of the bake as --truth ENV")
+        made = rendering.render(manifest, output, **options)
+        row, text = report.rendered_row(made), report.rendered_text(made)
+    else:
+        from whitefurnace import beside
+
+        with _progress(not as_json) as tell:
+            both = beside.render(manifest, output, truth=truth, **own, **options,
+                                 progress=(lambda what, share: tell(output.name, what, share)) if tell else None)
+        made, row, text = both, report.beside_row(both), report.beside_text(both)
     if as_json:
-        _json(report.rendered_row(made))
+        _json(row)
         return
     for notice in made.notices:
         _say(f"notice: {made.engine}: {notice}")
-    click.echo(report.rendered_text(made))
+    click.echo(text)
 
 
 EPILOG_INSPECT = """\b

@@ -331,11 +331,11 @@ def _symmetries() -> Iterator[tuple[str, np.ndarray]]:
 
 def _in_ours(found: Contents, axes: str | None, notices: list[str]) -> Contents:
     """Contents in our axes: those given, else a cube's of the engine that it was written for."""
-    if axes is None and (found.cube or found.kind == "harmonics") and found.engine is not None:
-        text = ENGINES[found.engine].axes
+    if axes is None and (found.cube or found.kind == "harmonics") and found.written_for is not None:
+        engine, text = found.written_for
         if not np.array_equal(axes_of(text), np.eye(3)):
             axes = text
-            notices.append(f"{found.path.name} was written for {found.engine}, in the axes {text}: it was turned back")
+            notices.append(f"{found.path.name} was written for {engine}, in the axes {text}: it was turned back")
     return found if axes is None else _turned(found, axes_of(axes))
 
 

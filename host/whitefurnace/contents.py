@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from whitefurnace.engines import ENGINES, HOLDS, Engine, File
+from whitefurnace.engines import ENGINES, HOLDS, Engine, File, axes_matrix
 from whitefurnace.environments import cube_solid_angles, faces_of, latlong_solid_angles
-from whitefurnace.errors import FileError, InputError
+from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import (
     Light,
     digest_file,
@@ -103,11 +103,23 @@ class Contents:
     notices: tuple[str, ...] = ()
 
     @property
-    def engine(self) -> str | None:
-        """Whose preset it was written for, where its manifest or its keys say so."""
-        told = self.statement.told.get("engine") if self.statement is not None else None
-        name = self.keys.get(f"{PREFIX}engine", told)
-        return name if isinstance(name, str) and name in ENGINES else None
+    def written_for(self) -> tuple[str, str] | None:
+        """The engine that it was written for and the axes of that, where its manifest or its keys say so: a user's as
+        the bake was given it."""
+        told = self.statement.told if self.statement is not None else {}
+        name = self.keys.get(f"{PREFIX}engine", told.get("engine"))
+        if not isinstance(name, str):
+            return None
+        axes: Any = told
+        for part in ("recipe", "engines", name, "engine", "axes"):
+            axes = axes.get(part) if isinstance(axes, Mapping) else None
+        if name in ENGINES and not isinstance(axes, str):
+            axes = ENGINES[name].axes
+        try:
+            axes_matrix(axes if isinstance(axes, str) else "")
+        except UsageError:
+            return None
+        return name, axes
 
     @property
     def holds(self) -> str | None:
@@ -311,11 +323,12 @@ def _of_image(path: Path, statement: Statement | None) -> Contents:
         return Contents(path, "table", container, form, (level,), keys=keys, facts=shown, largest=limit,
                         statement=statement)
     image = read_image(path)
-    found = faces_of(image.pixels)
+    atlas = statement is not None and statement.told.get("layout") == "octahedral"
+    found = None if atlas else faces_of(image.pixels)
     name, texels = found if found is not None else ("", image.pixels)
     kind = "image" if not name or image.pixels.shape[:2] == (1, 1) else "lat-long" if name == "latlong" else "cube"
-    if name:
-        shown["layout"] = name
+    if name or atlas:
+        shown["layout"] = name or "octahedral maps of all levels"
     row = {**_levels_told(statement).get(0, {}), **told}
     level = Level("level 0", texels, _number(row.get("roughness")), None, _figures(row))
     sh = told.get("sh")

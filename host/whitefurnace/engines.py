@@ -115,6 +115,7 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
     steps      what a user does with the files
     shading    how it weighs what it reads (rendering.SHADINGS)
     container  "npz" and "exr" are made of everything, without `files`; `latlong` asks for lat-long levels too
+    without    of "npz" and "exr", what of everything is left out (`reduced`)
     """
 
     name: str = ""
@@ -138,6 +139,7 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
     steps: tuple[str, ...] = ()
     container: Literal["npz", "exr", "files"] = "files"
     latlong: bool = False
+    without: tuple[str, ...] = ()
 
     @cached_property
     def lods(self) -> Lods:
@@ -180,7 +182,7 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
     def needs(self, holds: str) -> bool:
         """Whether a bake for it needs this. `npz` and `exr` hold the chain, irradiance, harmonics and the table."""
         if self.container != "files":
-            return holds in ("specular", "irradiance", "sh", "dfg")
+            return holds in ("specular", "irradiance", "sh", "dfg") and holds not in self.without
         if holds == "sh":
             return self.sh is not None
         return bool(self.holding(holds)) or (holds == "specular" and bool(self.holding("skybox")))
@@ -194,7 +196,10 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
 
     def data(self) -> dict[str, Any]:
         """All of it as plain data: what it says is part of a bake's key."""
-        return msgspec.to_builtins(self)  # type: ignore[no-any-return]
+        told: dict[str, Any] = msgspec.to_builtins(self)
+        if not self.without:
+            del told["without"]
+        return told
 
 
 DEFAULT_LOD = "max_lod * r * (2 - r)"
@@ -212,7 +217,7 @@ def axes_matrix(text: str, where: str = "axes") -> tuple[tuple[int, int, int], .
 
 
 _READ_BY_ITS_SOURCE = "read in the engine's source"
-_UNOPENED = "from third-party copies of its shaders; not proven in the engine"
+_UNOPENED = "from third-party copies of its shaders"
 
 _PRESETS = (
     Engine("raw", "numpy arrays in one .npz, GL-direct faces", container="npz", facts="this project's own",
@@ -308,7 +313,7 @@ _PRESETS = (
     ),
     Engine(
         "godot", "Godot 4: a panorama that it filters itself",
-        facts=_READ_BY_ITS_SOURCE + "; not proven in the engine", lod="sqrt(r) * max_lod", bend="alpha",
+        facts=_READ_BY_ITS_SOURCE, lod="sqrt(r) * max_lod", bend="alpha",
         file=(File("environment", "{stem}.hdr"),),
         steps=("import STEM.hdr as a PanoramaSkyMaterial's panorama; the sky is filtered by the engine, of our work "
                "its energy, its turn and its extracted sun survive",),
@@ -334,6 +339,36 @@ def engines(names: str) -> tuple[Engine, ...]:
     return tuple(chosen)
 
 
+REDUCIBLE = ("irradiance", "sh", "sheen", "dfg", "skybox")
+"""What a bake can do without, where no material reads it; `sheen` is Charlie's albedo in the table too."""
+
+
+def reduced(engine: Engine, without: Sequence[str] = (), table: int | None = None) -> Engine:
+    """An engine without some of what it holds, and with a split-sum table of `table` texels a side. Raises UsageError
+    for what cannot be left out."""
+    for holds in without:
+        if holds not in REDUCIBLE:
+            raise UsageError(f"{holds!r} cannot be left out{nearest(holds, REDUCIBLE)}")
+    if table is not None and not 1 <= table <= 4096:
+        raise UsageError(f"table {table} is outside [1, 4096]")
+    if engine.container != "files":
+        if table is not None:
+            raise UsageError(f"the table of {engine.name} has one size; --table is of engines' files")
+        return msgspec.structs.replace(engine, without=tuple(h for h in REDUCIBLE[:4] if h in without and h != "sheen"))
+    files = tuple(file for file in engine.file if file.holds not in without)
+    if not files:
+        raise UsageError(f"without {', '.join(without)} nothing of {engine.name} is left")
+    if "sh" in without and any(file.suffix == ".gltf" for file in files):
+        raise UsageError("an EXT_lights_image_based has its irradiance coefficients: sh cannot be left out")
+    dfg = msgspec.structs.replace(engine.dfg, charlie=engine.dfg.charlie and "sheen" not in without,
+                                  size=table or engine.dfg.size)
+    gone = [file.name.replace("{stem}", "STEM") for file in engine.file if file not in files]
+    steps = ["; ".join(part for part in step.split("; ") if not any(name in part for name in gone))
+             for step in engine.steps if not ("sh" in without and "harmonics" in step)]
+    return msgspec.structs.replace(engine, file=files, sh=None if "sh" in without else engine.sh, dfg=dfg,
+                                   steps=tuple(filter(None, steps)))
+
+
 def as_text(engine: Engine) -> str:
     """An engine as the TOML that `user_engine` reads: what differs from the defaults."""
     def value(x: Any) -> str:
@@ -349,7 +384,7 @@ def as_text(engine: Engine) -> str:
                 getattr(one, name) is not None and (name not in usual or getattr(one, name) != usual[name])]
 
     text = [f"# {engine.name}: {engine.facts}",
-            *lines(engine, ("name", "facts", "proven", "container", "latlong", "dfg", "file"))]
+            *lines(engine, ("name", "facts", "proven", "container", "latlong", "without", "dfg", "file"))]
     if table := lines(engine.dfg):
         text += ["", "[dfg]", *table]
     for file in engine.file:
@@ -378,7 +413,7 @@ def user_engine(path: str | os.PathLike[str]) -> Engine:
         data = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not TOML: {error}") from None
-    for key in ("name", "proven", "container", "latlong", "facts"):
+    for key in ("name", "proven", "container", "latlong", "without", "facts"):
         if key in data:
             raise InputError(f"{path}: {key} cannot be given; the name is the file's stem")
     for where, given, known in _tables(data):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from itertools import pairwise
@@ -87,7 +88,7 @@ class Expression:
         match node:
             case ast.Constant(value=bool()):
                 pass
-            case ast.Constant(value=int() | float() as value) if math.isfinite(value):
+            case ast.Constant(value=int() | float() as value) if abs(value) <= sys.float_info.max:
                 return
             case ast.Name(id=name):
                 if name in self.names:

@@ -167,7 +167,8 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float, *, cer
             finer = planning.refined(job.plan, missed, job.lobe.horizon) if job.lobe else None
             stuck = stuck + 1 if not level.error <= 0.9 * before else 0
             if finer is None or stuck == 2:
-                what = "mean" if job.lobe is None else job.lobe.name
+                what = "mean" if job.lobe is None else " of ".join([job.lobe.name, *(
+                    entry.name for entry, *_ in job.lobe.summands[:1])])
                 raise CheckError(f"level {what} of {'×'.join(map(str, job.shape.dims))} texels has an error of "
                                  f"{level.error:.2g}, over the tolerance {tolerance:g}, and finer grids do not help")
             job, before = replace(job, plan=finer), level.error
@@ -352,15 +353,16 @@ class Lighting:
 
 def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str = "",
           progress: Progress | None = None) -> Lighting:
-    """The whole of an environment under chains of one tolerance, sharing grids, certificates and equal levels. Raises
-    CheckError where a level cannot reach the tolerance, DeviceError where the device fails."""
+    """The whole of an environment under several chains, sharing grids, certificates and equal levels; irradiance is
+    held to the tolerance of the first. Raises CheckError where a level cannot reach its tolerance, DeviceError where
+    the device fails."""
     begin = time.perf_counter()
     recipe = wants[0].recipe
     convolver = Convolver(device, env, precision=planning.precision_for(recipe.tolerance), seed=seed,
                           progress=progress)
-    jobs, places = _distinct(convolver, wants)
+    jobs, places, tolerances = _distinct(convolver, wants)
     everything = [*jobs, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance, recipe.samples)]
-    levels = run_jobs(convolver, everything, recipe.tolerance, certify=recipe.certify)
+    levels = _run(convolver, everything, [*tolerances, recipe.tolerance], recipe.certify)
     sh, sh_error = convolver.harmonics()
     kept = [job.shape.mean(level.texels) / convolver.mean - 1 if convolver.mean > 0 else 0.0
             for job, level in zip(jobs, levels[:-1], strict=True)]
@@ -371,8 +373,8 @@ def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str 
         share = float(np.average(env.coverage, weights=source_solid_angles(env)))
         as_light = replace(env, texels=grey, coverage=None, statistics={"mean": [share] * 3})
         convolver = Convolver(device, as_light, precision=convolver.precision, seed=seed, progress=progress)
-        jobs, _ = _distinct(convolver, wants)
-        coverage = run_jobs(convolver, jobs, recipe.tolerance, certify=recipe.certify)
+        jobs, _, tolerances = _distinct(convolver, wants)
+        coverage = _run(convolver, jobs, tolerances, recipe.certify)
     chains = []
     for cubes, wide, square in places:
         covered = [tuple(coverage[k] for k in some) if coverage else () for some in (cubes, wide, square)]
@@ -382,12 +384,25 @@ def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str 
     return Lighting(tuple(chains), levels[-1], sh, sh_error, time.perf_counter() - begin)
 
 
-def _distinct(convolver: Convolver, wants: Sequence[Want]) -> tuple[list[Job], list[tuple[list[int], ...]]]:
-    """The jobs of all chains, each once, and for each chain the places of its cubes, lat-longs and octahedral maps."""
+def _run(convolver: Convolver, jobs: Sequence[Job], tolerances: Sequence[float], certify: int) -> list[Level]:
+    """`run_jobs`, together those of one tolerance."""
+    made: dict[int, Level] = {}
+    for tolerance in sorted(set(tolerances)):
+        some = [k for k, one in enumerate(tolerances) if one == tolerance]
+        made |= zip(some, run_jobs(convolver, [jobs[k] for k in some], tolerance, certify=certify), strict=True)
+    return [made[k] for k in range(len(jobs))]
+
+
+def _distinct(convolver: Convolver, wants: Sequence[Want]
+              ) -> tuple[list[Job], list[tuple[list[int], ...]], list[float]]:
+    """The jobs of all chains, each once; for each chain the places of its cubes, lat-longs and octahedral maps; and the
+    tolerance of each job, the least of the chains it is for."""
     jobs: list[Job] = []
+    tolerances: list[float] = []
     known: dict[Any, int] = {}
-    places = []
-    for want in wants:
+    places: list[tuple[list[int], ...]] = [() for _ in wants]
+    for w in sorted(range(len(wants)), key=lambda w: wants[w].recipe.tolerance):
+        want = wants[w]
         placed: tuple[list[int], ...] = ([], [], [])
         for kind, count in enumerate((want.cubes, want.latlongs, want.octahedral)):
             if count == 0:
@@ -398,9 +413,10 @@ def _distinct(convolver: Convolver, wants: Sequence[Want]) -> tuple[list[Job], l
                 if key not in known:
                     known[key] = len(jobs)
                     jobs.append(job)
+                    tolerances.append(want.recipe.tolerance)
                 placed[kind].append(known[key])
-        places.append(placed)
-    return jobs, places
+        places[w] = placed
+    return jobs, places, tolerances
 
 
 def prefilter(source: Any, *, size: int = 256, min_size: int | None = None, ndf: str | Model = "ggx",

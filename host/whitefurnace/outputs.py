@@ -13,6 +13,7 @@ from whitefurnace import harmonic
 from whitefurnace.certificate import texel_errors
 from whitefurnace.convolution import Level
 from whitefurnace.engines import Engine, File
+from whitefurnace.errors import UsageError
 from whitefurnace.files import (
     EnvMap,
     GltfLight,
@@ -103,7 +104,7 @@ def _level_told(level: Level, kept: np.ndarray, true: np.ndarray) -> dict[str, A
             **_stored(kept[..., :3], true, mean)}
 
 
-def _clipped(form: str, clipped: Sequence[int]) -> dict[str, Any]:
+def _clipped(clipped: Sequence[int]) -> dict[str, Any]:
     return {"clipped": int(sum(clipped))} if sum(clipped) else {}
 
 
@@ -129,7 +130,7 @@ def _texture(engine: Engine, path: Path, file: File, levels: Sequence[Level], ma
         keys = {}  # has no place for them
     encoded = encode(file.stored, held, cube=True, key_values=keys)
     back = [encoded.texture.decode(k) for k in range(len(levels))]
-    told = {"holds": file.holds, "format": file.stored, **_clipped(file.stored, encoded.clipped),
+    told = {"holds": file.holds, "format": file.stored, **_clipped(encoded.clipped),
             "levels": [_level_told(*one) for one in zip(levels, back, turned, strict=True)]}
     inverse = np.array(engine.matrix).T
     return Target(path, engine.name, _size(encoded.texture),
@@ -141,16 +142,24 @@ def _size(texture: Texture) -> int:
     return sum(memoryview(level).nbytes for level in texture.levels)
 
 
-def _cube_bytes(sizes: Sequence[int], file: File) -> int:
-    per = {"b10g11r11": 4, "rgb9e5": 4, "rgbd": 4, "rgba16f": 8, "rgba32f": 16, "float32": 12}
+def _square_bytes(size: int, file: File, channels: int = 3) -> int:
+    """Bytes of size² texels before any compression."""
+    per = {"b10g11r11": 4, "rgb9e5": 4, "rg16f": 4, "rgbd": 4, "rgba16f": 8, "rgba32f": 16, "float32": 4 * channels}
     if file.stored in per:
-        return sum(6 * s * s * per[file.stored] for s in sizes)
-    return sum(6 * max(-(-s // 4), 1) ** 2 * 16 for s in sizes)  # blocks of 4 × 4
+        return size * size * per[file.stored]
+    return (-(-size // 4)) ** 2 * 16  # blocks of 4 × 4
+
+
+def _cube_bytes(sizes: Sequence[int], file: File) -> int:
+    return 6 * sum(_square_bytes(size, file) for size in sizes)
 
 
 def _specular(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
     sizes = [s for s, _ in chain.levels]
     if made is None:
+        if file.layout == "octahedral" and file.border > sizes[-1]:
+            raise UsageError(f"{engine.name}: a border of {file.border} texels does not go around the last level's "
+                             f"{sizes[-1]}²; give a lower border or a larger --min-size")
         return Target(path, engine.name, _cube_bytes(sizes, file) // (6 if file.layout == "octahedral" else 1))
     if file.layout == "octahedral":
         return _octahedral(engine, path, file, made)
@@ -205,7 +214,7 @@ def _octahedral(engine: Engine, path: Path, file: File, made: Made) -> Target:
             path, image, channel_names=tuple("RGBA"[:image.shape[-1]]), attributes=texts, into=t), told)
     keys = {} if path.suffix == ".dds" else _keys(engine, made, [level.error for level in levels])
     encoded = encode(file.stored, maps, key_values=keys)
-    told |= _clipped(file.stored, encoded.clipped)
+    told |= _clipped(encoded.clipped)
     told["levels"] = [_level_told(level, encoded.texture.decode(k), level.texels) for k, level in enumerate(levels)]
     return Target(path, engine.name, _size(encoded.texture),
                   lambda t: write_texture(path, encoded.texture, zstd=file.zstd, into=t), told)
@@ -254,7 +263,7 @@ def _whole(engine: Engine, path: Path, levels: Sequence[Level], made: Made,
            write: Callable[[Sequence[np.ndarray], Transaction], object]) -> Target:
     """A container of RGBD faces with harmonics."""
     turned, back, clipped = _rgbd(levels, engine)
-    told = {"holds": "specular, sh", "format": "rgbd", **_clipped("rgbd", [clipped]), "scale": engine.sh,
+    told = {"holds": "specular, sh", "format": "rgbd", **_clipped([clipped]), "scale": engine.sh,
             "sh_error": made.lit.sh_error,
             "levels": [_level_told(*one) for one in zip(levels, back, turned, strict=True)]}
     inverse = np.array(engine.matrix).T
@@ -297,8 +306,7 @@ def _environment(engine: Engine, chain: Chain, path: Path, file: File, made: Mad
 def _dfg(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
     n, channels = engine.dfg.size, 3 if engine.dfg.charlie else 2
     if made is None:
-        return Target(path, engine.name, n * n * {"rg16f": 4, "rgba16f": 8, "rgba32f": 16, "rgbd": 4,
-                                                  "float32": 4 * channels}[file.stored])
+        return Target(path, engine.name, _square_bytes(n, file, channels))
     assert made.split is not None
     values = made.split.values
     told = {"holds": "dfg", "format": file.stored, "size": n, "error": made.split.error, "rule": made.split.rule,
@@ -330,15 +338,19 @@ _WRITERS = {"specular": _specular, "skybox": _skybox, "irradiance": _irradiance,
 
 def _npz(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made | None) -> list[Target]:
     path = folder / engine.name / f"{stem}.npz"
-    count = 3 * sum(6 * s * s for s, _ in chain.levels) + 3 * 6 * IRRADIANCE_SIZE**2 + 2 * DFG_SIZE**2
+    count = 3 * sum(6 * s * s for s, _ in chain.levels) + sum(n for holds, n in (
+        ("irradiance", 3 * 6 * IRRADIANCE_SIZE**2), ("dfg", 2 * DFG_SIZE**2)) if engine.needs(holds))
     if made is None:
         return [Target(path, engine.name, 4 * count)]
     lit, levels = made.lit, made.chain.levels
-    arrays: dict[str, np.ndarray] = {f"specular_{k}": level.texels for k, level in enumerate(levels)}
+    arrays: dict[str, np.ndarray] = {f"specular_{k}": level.texels for k, level in enumerate(levels, chain.first)}
     for statistic in ("roughness", "error", "worst", "rmse"):
-        arrays[statistic] = np.array([getattr(level, statistic) for level in levels])
-    arrays |= {"irradiance": lit.irradiance.texels, "sh": lit.sh, "dfg": made.table.values}
-    arrays |= {f"coverage_{k}": level.texels[..., 0] for k, level in enumerate(made.chain.coverage)}
+        arrays[statistic] = np.full(len(chain.all_levels), np.nan)  # of levels that are not made
+        arrays[statistic][chain.first:chain.first + len(levels)] = [getattr(level, statistic) for level in levels]
+    arrays["roughness"] = np.array([r for _, r in chain.all_levels])
+    rest = {"irradiance": lit.irradiance.texels, "sh": lit.sh, "dfg": made.table.values}
+    arrays |= {holds: array for holds, array in rest.items() if engine.needs(holds)}
+    arrays |= {f"coverage_{k}": level.texels[..., 0] for k, level in enumerate(made.chain.coverage, chain.first)}
     return [Target(path, engine.name, 4 * count, lambda t: write_npz(path, arrays, into=t),
                    levels=tuple(level.texels for level in levels))]
 
@@ -364,25 +376,23 @@ def _exr(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made | Non
     for k, (size, _) in enumerate(chain.levels):
         cube, wide = (6 * size, size), (2 * size, 4 * size)
         if made is None:
-            add(f"specular_{k}", cube, None)
-            add(f"specular_{k}_latlong", wide, None)
+            add(f"specular_{k + chain.first}", cube, None)
+            add(f"specular_{k + chain.first}_latlong", wide, None)
             continue
         for ending, shape, level, coverage in (
-            (f"specular_{k}", cube, made.chain.levels[k], made.chain.coverage),
-            (f"specular_{k}_latlong", wide, made.chain.latlongs[k], made.chain.latlong_coverage),
+            (f"specular_{k + chain.first}", cube, made.chain.levels[k], made.chain.coverage),
+            (f"specular_{k + chain.first}_latlong", wide, made.chain.latlongs[k], made.chain.latlong_coverage),
         ):
             add(ending, shape, level.texels, coverage[k].texels[..., 0] if coverage else None, attributes={
                 "roughness": level.roughness, "error": level.error, "worst": level.worst, "rmse": level.rmse,
                 "method": level.method})
     irradiance = (6 * IRRADIANCE_SIZE, IRRADIANCE_SIZE)
-    if made is None:
-        add("irradiance", irradiance, None)
-        add("dfg", (DFG_SIZE, DFG_SIZE), None, channels="RG")
-        return found
-    lit, table = made.lit, made.table
-    add("irradiance", irradiance, lit.irradiance.texels, attributes={
-        "error": lit.irradiance.error, "sh": json.dumps(lit.sh.tolist())})
-    add("dfg", (DFG_SIZE, DFG_SIZE), table.values, channels="RG", attributes={"error": table.error, "rule": table.rule})
+    if engine.needs("irradiance"):
+        add("irradiance", irradiance, made.lit.irradiance.texels if made else None, attributes={
+            "error": made.lit.irradiance.error, "sh": json.dumps(made.lit.sh.tolist())} if made else None)
+    if engine.needs("dfg"):
+        add("dfg", (DFG_SIZE, DFG_SIZE), made.table.values if made else None, channels="RG",
+            attributes={"error": made.table.error, "rule": made.table.rule} if made else None)
     return found
 
 

@@ -404,6 +404,6 @@ def alternatives(recipe: Chain) -> list[Chain]:
 
 def compared(device: Device, env: Environment, recipe: Chain, *, alone: bool = False) -> list[AsRead]:
     """`alternatives` as they are read, the levels exact; `alone`: the plan only, where an engine allows no other."""
-    choices = [recipe] if alone or recipe.levels[-1][1] > 1 else alternatives(recipe)
+    choices = [recipe] if alone or recipe.only or recipe.levels[-1][1] > 1 else alternatives(recipe)
     reader = Reader(device, env, *choices)
     return [reader.as_read(choice, texels=len(choice.levels) == len(recipe.levels)) for choice in choices]

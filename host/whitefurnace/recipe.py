@@ -6,7 +6,7 @@ import math
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -229,6 +229,7 @@ class Chain:
     `count` levels, None for those that halving gives; sizes past `min_size` stay there. `fit` "read" bakes mixtures
     of lobes that read best between levels (fitting.py), None each level's own lobe. `samples` is how many a texel of
     filtered importance sampling takes, on every level r > 0 and in irradiance; None: what the tolerance needs.
+    `only` are the first and last level that are made, None for all of them; lods count those.
     """
 
     ndf: Chosen
@@ -240,16 +241,28 @@ class Chain:
     samples: int | None = None
     certify: int = CERTIFIED
     lods: Lods = Lods()
+    only: tuple[int, int] | None = None
 
     @cached_property
-    def levels(self) -> tuple[tuple[int, float], ...]:
-        """(size, perceptual roughness) of each level."""
+    def all_levels(self) -> tuple[tuple[int, float], ...]:
+        """(size, perceptual roughness) of each level, those that are not made too."""
         n = self.count or int(math.log2(self.size // self.min_size)) + 1
         return tuple((max(self.size >> k, self.min_size), self.lods.roughness(k, n, self.size)) for k in range(n))
 
+    @cached_property
+    def levels(self) -> tuple[tuple[int, float], ...]:
+        """(size, perceptual roughness) of each level that is made."""
+        return self.all_levels if self.only is None else self.all_levels[self.only[0]:self.only[1] + 1]
+
+    @property
+    def first(self) -> int:
+        """The number of the first level that is made."""
+        return self.only[0] if self.only else 0
+
     def lod(self, roughness: float) -> float:
         """The lod that is read for a roughness."""
-        return self.lods.at(roughness, len(self.levels), self.size)
+        lod = self.lods.at(roughness, len(self.all_levels), self.size)
+        return lod if self.only is None else min(max(lod - self.first, 0.0), len(self.levels) - 1.0)
 
     def parameters(self, roughness: float) -> dict[str, float]:
         """The NDF's parameters at a perceptual roughness."""
@@ -264,13 +277,14 @@ class Chain:
     def canonical(self) -> dict[str, Any]:
         return {"ndf": self.ndf.canonical(), "size": self.size, "min_size": self.min_size,
                 **({"tolerance": self.tolerance} if self.samples is None else {"samples": self.samples}),
-                "roughness": [r for _, r in self.levels], "fit": self.fit, "certify": self.certify}
+                "roughness": [r for _, r in self.levels], "fit": self.fit, "certify": self.certify,
+                **({"only": list(self.only)} if self.only else {})}
 
 
 def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = MIN_SIZE) -> int:
     """Face edge of the last level: as given, what `levels` halvings leave, or the usual one. Raises UsageError."""
     if levels is None:
-        return min(usual, size) if min_size is None and usual != MIN_SIZE else usual if min_size is None else min_size
+        return usual if min_size is None else min_size
     low, high = LEVELS_RANGE
     if not (is_number(levels) and low <= levels <= high and levels == int(levels)):
         raise UsageError(f"levels {levels!r} is not a whole number in [{low}, {high}]")
@@ -289,11 +303,12 @@ def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = 
 def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int | None = None, tolerance: float | None = None,
           quality: str | None = None, levels: int | None = None, fit: str | None = None,
           samples: int | None = None, certify: int = CERTIFIED, lods: Lods | None = None,
-          usual_min: int = MIN_SIZE) -> Chain:
+          usual_min: int = MIN_SIZE, only_levels: str | None = None) -> Chain:
     """A validated specular chain.
 
     lods: the mapping of an engine, Filament's and three.js's without; `usual_min`: the last size where none is given.
     `min_size` is 16, or with `levels` what as many halvings leave; with both, sizes halve to `min_size` and stay.
+    only_levels: "A-B", those that are made.
     Raises UsageError for a size that is no power of two, a `min_size` over `size`, levels that do not fit, a bad
     tolerance or name, samples out of range or beside one of these; UnsupportedError for an NDF that cannot be
     prefiltered (anisotropic, or without a roughness).
@@ -329,6 +344,13 @@ def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int | None = N
                          "that bound 99 % of a level at 95 % confidence")
     made = Chain(choice, size, smallest, tolerance_of(tolerance, quality), None if levels is None else int(levels), fit,
                  count, int(certify), lods or Lods())
+    if only_levels is not None:
+        found = re.fullmatch(r"\s*(\d{1,3})\s*-\s*(\d{1,3})\s*", only_levels)
+        if not found or not int(found[1]) <= int(found[2]) < len(made.levels):
+            raise UsageError(f"only-levels {only_levels!r} is not A-B with 0 <= A <= B <= {len(made.levels) - 1}")
+        if fit:
+            raise UsageError("give a fit or only-levels, not both: a fit mixes lobes over all levels")
+        made = replace(made, only=(int(found[1]), int(found[2])))
     if fit and made.levels[-1][1] > 1:
         raise UnsupportedError(f"fit {fit!r} goes up to r = 1; the last level of this mapping is at "
                                f"r = {made.levels[-1][1]:.3g}")

@@ -55,11 +55,12 @@ class Lights:
 
 
 def shade(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, base_color: Any, metalness: Any,
-          roughness: Any) -> np.ndarray:
+          roughness: Any, insulator: Any = DIELECTRIC) -> np.ndarray:
     """(m, 3) linear radiance towards v of points with normals n, both unit vectors (3, m) of the world with n·v > 0,
     lit by the environment alone.
 
-    `base_color` (3,) or (m, 3), `metalness` and perceptual `roughness` numbers or (m,), all in [0, 1]. What is read,
+    `base_color` (3,) or (m, 3), `metalness` and perceptual `roughness` numbers or (m,), all in [0, 1]; `insulator` is F0
+    of what is no metal, a number or (m, 3). What is read,
     where, and how it is weighed is the engine's: lod(r), direction, axes, seamless trilinear reads, its irradiance, its
     table bilinearly on its own axes, its way of keeping energy (`SHADINGS`). Everything is linear in what is stored.
     """
@@ -73,7 +74,7 @@ def shade(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, base_col
     radiance = specular(engine, lights, n, v, r)
     radiance = radiance + (diffuse - radiance) * blend
     A, B = split_sum(engine, lights.dfg, NoV, r)
-    weights = SHADINGS[engine.shading](A[:, None], B[:, None], color, metal, r[:, None], NoV[:, None])
+    weights = SHADINGS[engine.shading](A[:, None], B[:, None], color, metal, r[:, None], NoV[:, None], insulator)
     return weights[0] * radiance + weights[1] * diffuse
 
 
@@ -167,54 +168,54 @@ Weights = tuple[np.ndarray, np.ndarray]
 
 
 def _split_sum(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-               NoV: np.ndarray) -> Weights:
+               NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
     """[Karis2013]: nothing is given back of what single scattering loses."""
-    E = (DIELECTRIC + (color - DIELECTRIC) * metal) * A + B
+    E = (insulator + (color - insulator) * metal) * A + B
     return E, color * (1 - metal) * (1 - E)
 
 
 def _scaled(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-            NoV: np.ndarray) -> Weights:
+            NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
     """Filament: E · (1 + F0 (1/E₁ - 1)) with E₁ = A + B, that of F0 = 1; what is left for the diffuse is 1 - E."""
-    F0 = DIELECTRIC + (color - DIELECTRIC) * metal
+    F0 = insulator + (color - insulator) * metal
     E = F0 * A + B
     return E * (1 + F0 * (1 / (A + B) - 1)), color * (1 - metal) * (1 - E)
 
 
 def _babylon(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-             NoV: np.ndarray) -> Weights:
+             NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
     """Babylon.js 9: the same scaling; the diffuse keeps all but F0 of what arrives, whatever the specular takes, as is
     its default (LEGACY_SPECULAR_ENERGY_CONSERVATION)."""
-    return _scaled(A, B, color, metal, r, NoV)[0], color * (1 - DIELECTRIC) * (1 - metal)
+    return _scaled(A, B, color, metal, r, NoV, insulator)[0], color * (1 - insulator) * (1 - metal)
 
 
 def _fdez_aguera(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-                 NoV: np.ndarray) -> Weights:
+                 NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
     """three.js and Bevy: [FdezAguera2019] for the dielectric and the metal, each alone, and mixed."""
     def scattered(F0: Any) -> tuple[np.ndarray, np.ndarray]:
         once, lost, average = F0 * A + B, 1 - (A + B), F0 + (1 - F0) / 21
         return once, once * average / (1 - lost * average) * lost
 
-    (once, again), (metal_once, metal_again) = scattered(DIELECTRIC), scattered(color)
+    (once, again), (metal_once, metal_again) = scattered(insulator), scattered(color)
     return (once + (metal_once - once) * metal,
             again + (metal_again - again) * metal + color * (1 - metal) * (1 - once - again))
 
 
 def _khronos(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-             NoV: np.ndarray) -> Weights:
+             NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
     """Khronos glTF Sample Viewer: [FdezAguera2019] with a Fresnel that depends on roughness, all times radiance."""
     def fresnel(F0: Any) -> np.ndarray:
         k = F0 + (np.maximum(1 - r, F0) - F0) * (1 - NoV) ** 5
         once, lost, average = k * A + B, 1 - (A + B), F0 + (1 - F0) / 21
         return np.asarray(once + lost * once * average / (1 - average * lost))
 
-    dielectric = fresnel(DIELECTRIC)
+    dielectric = fresnel(insulator)
     return dielectric + (fresnel(color) - dielectric) * metal, color * (1 - dielectric) * (1 - metal)
 
 
-SHADINGS: Mapping[str, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray], Weights]] = {
+SHADINGS: Mapping[str, Callable[..., Weights]] = {
     "split_sum": _split_sum, "scaled": _scaled, "babylon": _babylon, "fdez_aguera": _fdez_aguera, "khronos": _khronos}
-"""By `Engine.shading`: weights of radiance and of E/π from (A, B, base colour, metalness, r, NoV)."""
+"""By `Engine.shading`: weights of radiance and of E/π from (A, B, base colour, metalness, r, NoV, F0 of insulators)."""
 
 
 # ------------------------------------------------------------------------------------------------- files
@@ -317,8 +318,8 @@ def _maps(file: File, path: Path, manifest: Path) -> tuple[tuple[np.ndarray, ...
             raise InputError(f"{path} is not a square, an octahedral map is")
         return tuple(np.pad(texels, ((1, 1), (1, 1), (0, 0)), "edge") for texels in levels), 1
     image = read_stored(path)[..., :3]
-    files = _listed(_dict(read_manifest(manifest)))
-    told, b = _dict(files.get(f"{path.parent.name}/{path.name}")).get("levels"), file.border
+    files = _listed(dictionary(read_manifest(manifest)))
+    told, b = dictionary(files.get(f"{path.parent.name}/{path.name}")).get("levels"), file.border
     count = len(told) if isinstance(told, list) else 0
     # Level 0 and its border, and at its right, where there are more, level 1 and its own (octamap.atlas_places).
     size = image.shape[1] - 2 * b if count == 1 else (image.shape[1] - 4 * b) * 2 // 3
@@ -348,11 +349,11 @@ def engine_in(manifest: str | os.PathLike[str], name: str) -> tuple[Engine, Path
     if not path.is_file():
         raise FileError(f"cannot read {path}: there is no such file")
     found = read_manifest(path)
-    listed = _listed(_dict(found))
+    listed = _listed(dictionary(found))
     if found is None or not listed or not isinstance(found.get("name"), str):
         raise InputError(f"{path} is not the manifest of a bake")
     names = sorted({entry.split("/")[0] for entry in listed if "/" in entry})
-    recipe = _dict(_dict(_dict(found.get("recipe")).get("engines")).get(name))
+    recipe = dictionary(dictionary(dictionary(found.get("recipe")).get("engines")).get(name))
     chosen = (engine_of_data(recipe["engine"], str(path)),) if "engine" in recipe else engines(name)
     if len(chosen) != 1:
         raise UsageError(f"{name} are {len(chosen)} engines; a picture is of one")
@@ -365,16 +366,16 @@ def engine_in(manifest: str | os.PathLike[str], name: str) -> tuple[Engine, Path
         file = path.parent / entry
         if not file.is_file():
             raise FileError(f"cannot read {file}: {path} lists it and it is not there")
-        if digest_file(file) != _dict(told).get("sha256"):
+        if digest_file(file) != dictionary(told).get("sha256"):
             raise InputError(f"{file} is not the file that {path} lists: it was changed since the bake")
     return engine, path.parent / engine.name, found["name"]
 
 
 def _listed(manifest: dict[str, Any]) -> dict[str, Any]:
-    return {**_dict(manifest.get("kept")), **_dict(manifest.get("files"))}
+    return {**dictionary(manifest.get("kept")), **dictionary(manifest.get("files"))}
 
 
-def _dict(value: Any) -> dict[str, Any]:
+def dictionary(value: Any) -> dict[str, Any]:
     return value if isinstance(value, dict) else {}
 
 
@@ -447,25 +448,30 @@ def grid(engine: Engine, lights: Lights, *, columns: int = 7, rows: int = 3, siz
         picture[band] = _behind(engine, lights, picture.shape, band) if background == "environment" else GREY
         for j in range(columns):
             cell = picture[band, j * size:(j + 1) * size].reshape(-1, 3)  # a copy
-            lit = shade(engine, lights, n, v, color, _steps(rows, 1.0)[i], _steps(columns, 0.0)[j])
+            lit = shade(engine, lights, n, v, color, steps(rows, 1.0)[i], steps(columns, 0.0)[j])
             cell[index] += (lit - cell[index]) * cover[:, None]
             picture[band, j * size:(j + 1) * size] = cell.reshape(size, size, 3)
     return picture
 
 
-def _steps(count: int, alone: float) -> tuple[float, ...]:
+def steps(count: int, alone: float) -> tuple[float, ...]:
     return tuple(float(x) for x in np.linspace(0, 1, count)) if count > 1 else (alone,)
 
 
-def _behind(engine: Engine, lights: Lights, shape: tuple[int, ...], band: slice) -> np.ndarray:
-    """What a camera that looks along -z, +y up, sees of level 0 in those rows of a picture."""
+def camera(shape: tuple[int, ...], band: slice = slice(None)) -> np.ndarray:
+    """(3, m) world directions of the pixels in those rows of a picture, of a camera that looks along -z with +y up."""
     height, width = shape[:2]
     scale = 2 * math.tan(VIEW / 2) / height
     x = (np.arange(width) + 0.5 - width / 2) * scale
-    y = (height / 2 - 0.5 - np.arange(band.start, band.stop)) * scale
+    y = (height / 2 - 0.5 - np.arange(height)[band]) * scale
     d = np.stack([np.tile(x, len(y)), np.repeat(y, width), np.full(width * len(y), -1.0)])
-    d = stored_directions(engine, d / np.sqrt((d * d).sum(0)))
-    return level(lights.levels[0], d, lights.border).reshape(-1, width, 3)
+    return np.asarray(d / np.sqrt((d * d).sum(0)))
+
+
+def _behind(engine: Engine, lights: Lights, shape: tuple[int, ...], band: slice) -> np.ndarray:
+    """What the camera sees of level 0 in those rows of a picture."""
+    d = stored_directions(engine, camera(shape, band))
+    return level(lights.levels[0], d, lights.border).reshape(-1, shape[1], 3)
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
@@ -493,5 +499,5 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
     lights = read_lights(engine, folder, stem)
     picture = grid(engine, lights, columns=columns, rows=rows, size=size, base_color=base_color, background=background)
     write_png(output, srgb(picture * 2.0**exposure))
-    return Rendered(output, engine.name, picture.shape[1], picture.shape[0], _steps(columns, 0.0), _steps(rows, 1.0),
+    return Rendered(output, engine.name, picture.shape[1], picture.shape[0], steps(columns, 0.0), steps(rows, 1.0),
                     exposure, lights.read, lights.notices)

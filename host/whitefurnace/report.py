@@ -10,12 +10,18 @@ from whitefurnace.catalogue.bibliography import PAPERS
 
 if TYPE_CHECKING:
     from whitefurnace.baking import Baked
+    from whitefurnace.batch import Result, Tally
     from whitefurnace.benching import Case, Spread, Throughput, Yardstick
+    from whitefurnace.beside import Rendered as Beside
+    from whitefurnace.budget import Budget, Choice, Entry
     from whitefurnace.catalogue import Model
     from whitefurnace.comparison import Comparison
     from whitefurnace.device import Candidate
     from whitefurnace.engines import Engine
+    from whitefurnace.needs import Needs
     from whitefurnace.rendering import Rendered
+    from whitefurnace.scene import Material, Scene
+    from whitefurnace.scene import Spread as Span
     from whitefurnace.tables import Table
     from whitefurnace.tradeoff import Cost, Missed, Point
     from whitefurnace.verification import Row
@@ -50,12 +56,16 @@ def baked_text(baked: Baked, output: Path) -> str:
     m = baked.manifest
     rows = []
     several = len({tuple(row.get("for", ())) for row in baked.levels}) > 1
-    for k, row in enumerate(baked.levels):
-        what = f"{row.get('ndf', 'specular')} of {', '.join(row['for'])}" if several else f"specular {k}"
+    counts: dict[str, int] = {}
+    for row in baked.levels:
+        name = "sheen" if row.get("ndf") == "charlie" else "specular"
+        # Level 0 is the image itself, whatever the lobe.
+        counts[name] = counts.get(name, 0 if name == "sheen" else _first(m) - 1) + 1
+        what = f"{name} of {', '.join(row['for'])}" if several else f"{name} {counts[name]}"
         rows.append([what, f"{row['size']}²", f"{row['roughness']:.3f}", f"{row['error']:.1e}",
                      f"{row['worst']:.1e}", f"{row['rmse']:.1e}", row["method"], f"{row['seconds']:.2f} s"])
     wide = m.get("latlong_levels", [])
-    for k, row in enumerate(wide):
+    for k, row in enumerate(wide, _first(m)):
         rows.append([f"lat-long {k}", f"{row['size']}×{row['size'] // 2}", f"{row['roughness']:.3f}",
                      f"{row['error']:.1e}", f"{row['worst']:.1e}", f"{row['rmse']:.1e}", row["method"], ""])
     e = m["irradiance"]
@@ -97,7 +107,8 @@ def engine_text(engine: Engine) -> str:
     """One engine: its files and how they are read."""
     lines = [f"{engine.name}: {engine.title}", f"  facts      {engine.facts}",
              f"  lod(r)     {engine.lods_text}" + (", past r = 1 a lobe of that α" if engine.follow else ""),
-             f"  sizes      {engine.size}² to " + (f"{engine.levels} levels" if engine.levels else f"{engine.min_size}²"),
+             f"  sizes      {engine.size}², " + (f"{engine.levels} levels" if engine.levels else
+                                                 f"to {engine.min_size}²"),
              f"  axes       {engine.axes}"]
     if engine.container == "files":
         lines += [f"  direction  mix(mirror, normal, {engine.bend})"] if engine.bend != "0" else []
@@ -106,7 +117,8 @@ def engine_text(engine: Engine) -> str:
         lines += [f"  harmonics  {engine.sh}"] if engine.sh else []
         d = engine.dfg
         lines += [f"  table      {d.size}², x = {d.x}, y = {d.y}, {d.form}" + (", Charlie" if d.charlie else "")]
-        lines += [f"  file       {file.name.replace('{stem}', 'STEM')}: {file.holds}, {file.stored}" for file in engine.file]
+        lines += [f"  file       {file.name.replace('{stem}', 'STEM')}: {file.holds}, {file.stored}"
+                  for file in engine.file]
         lines += [f"  step       {step}" for step in engine.steps]
     return "\n".join(lines)
 
@@ -127,12 +139,17 @@ def _format_text(entry: Mapping[str, Any]) -> str:
     return "  " + ", ".join(parts)
 
 
+def _first(manifest: Mapping[str, Any]) -> int:
+    """The number of the first level that is made."""
+    return int((manifest["recipe"].get("only") or [0])[0])
+
+
 def planned_text(baked: Baked) -> str:
     """What a bake would do."""
     several = len({names for names, _ in baked.plan}) > 1
     rows = [[f"specular of {', '.join(names)}" if several else f"specular {k}", f"{p.size}²", f"{p.roughness:.3f}",
              f"{p.grid}²" if p.grid else f"{p.samples} samples" if p.samples else "texel mean", f"{p.pairs:.2g}",
-             f"{p.cuts}×{p.cuts}"] for k, (names, p) in enumerate(baked.plan)]
+             f"{p.cuts}×{p.cuts}"] for k, (names, p) in enumerate(baked.plan, _first(baked.manifest))]
     lines = [f"{baked.name}: would bake, key {baked.manifest['key'][:12]}…",
              table(["", "size", "r", "source grid a face", "lobe evaluations", "nodes a texel"], rows)]
     for path, nbytes in zip(baked.files, baked.nbytes, strict=True):
@@ -166,9 +183,10 @@ def baked_rows(baked: Baked) -> list[dict[str, Any]]:
     if baked.state == "planned":
         rows += [{"event": "level", "name": baked.name, "level": k, "for": list(names), "size": p.size,
                   "roughness": p.roughness, "grid": p.grid, "samples": p.samples, "pairs": p.pairs, "cuts": p.cuts}
-                 for k, (names, p) in enumerate(baked.plan)]
+                 for k, (names, p) in enumerate(baked.plan, _first(baked.manifest))]
     else:
-        rows += [{"event": "level", "name": baked.name, "level": k, **row} for k, row in enumerate(baked.levels)]
+        rows += [{"event": "level", "name": baked.name, "level": k, **row}
+                 for k, row in enumerate(baked.levels, _first(baked.manifest))]
     rows += [{"event": "as_read", "name": baked.name, **read} for read in baked.as_read]
     m = baked.manifest
     whole: dict[str, Any] = {"event": baked.state, "name": baked.name, "key": m["key"], "seconds": baked.seconds,
@@ -190,15 +208,17 @@ def table_text(table: Table) -> str:
     m = table.manifest
     recipe = m.get("recipe", m)
     shape = " × ".join(str(n) for n in table.shape)
-    lines = [f"{name}: {recipe['integral']}, " + ", ".join(c["name"] for c in recipe["models"].values()) +
+    of = ", ".join(c["name"] for c in recipe["models"].values()) or recipe["scheme"]
+    lines = [f"{name}: {recipe['integral']}, {of}"
              f"; array of {shape}, float{recipe['precision']}"]
     lines += [f"  {axis}  {along}" for axis, along in zip("xyzuvw", table.axes, strict=False)]
     if table.state == "planned":
         return "\n".join([*lines, f"  would write {name}  {size(table.nbytes)} before compression",
                           f"  would write {beside}  the manifest"])
     lines += _told_of_table(m)
-    return "\n".join([*lines, f"  error {m['error']:.1e}, rule {m['rule']}, {m['evaluations']:.2g} evaluations, "
-                      f"on {m['device']['name']} ({m['device']['platform']})",
+    where = f"on {m['device']['name']} ({m['device']['platform']})" if "device" in m else "in numpy"
+    done = f"  error {m['error']:.1e}, rule {m['rule']}, {m['evaluations']:.2g} evaluations, {where}"
+    return "\n".join([*lines, done,
                       f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {table.seconds:.2f} s"])
 
 
@@ -539,3 +559,212 @@ def rendered_text(made: Rendered) -> str:
     return "\n".join([f"{made.path}: {made.width} × {made.height} pixels, {made.engine}, exposure {made.exposure:g}",
                       f"  across  roughness {columns}", f"  down    metalness {rows}",
                       *(f"  read    {path}" for path in made.read)])
+
+
+def beside_row(made: Beside) -> dict[str, Any]:
+    return {**rendered_row(made), "certificate": [vars(held) for held in made.certificate],
+            "error": made.error if made.certificate else None}
+
+
+def beside_text(made: Beside) -> str:
+    seconds = ", ".join(f"{name} {value:.1f} s" for name, value in made.seconds.items())
+    return "\n".join([
+        rendered_text(made),
+        f"  truth   samples {' '.join(map(str, made.samples))} a pixel, within {max(made.estimates):.1e} of four times "
+        f"as many; {seconds}",
+        *(f"  error   roughness {held.roughness:.3g}, n·v {held.NoV:.2f}, {held.of}: {held.error:.1e} of "
+          f"{' '.join(f'{x:.4g}' for x in held.exact)} by quadrature" for held in made.certificate),
+        f"  differs by {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of 100; "
+        f"the colours reach {100 * made.scale:g} %"])
+
+
+# ---------------------------------------------------------------------------------------------- scenes
+
+
+def scene_text(scene: Scene, needs: Needs) -> str:
+    """What is in a scene, and what it needs."""
+    box = scene.extent
+    uses = sum(m.uses for m in scene.materials)
+    head = [f"{len(scene.materials)} material{'' if len(scene.materials) == 1 else 's'} on {uses} "
+            f"primitive{'' if uses == 1 else 's'}"]
+    head += [" × ".join(f"{x:.3g}" for x in box) + " m"] if box else []
+    for count, what in ((len(scene.cameras), "camera"), (scene.lights, "punctual light")):
+        head += [f"{count} {what}{'' if count == 1 else 's'}"] if count else []
+    rows = [[m.name, _spread_text(m["base_color"]), _spread_text(m["metalness"]), _spread_text(m["roughness"]),
+             ", ".join(_also(m))] for m in scene.materials]
+    lines = [f"{scene.path}: {', '.join(head)}"]
+    lines += [table(["material", "base colour", "metalness", "roughness", "and"], rows, left=5)] if rows else []
+    lines.append(f"  for {needs.engine.name}, before compression:")
+    verdict = {True: "yes", False: "no", None: "cannot"}
+    lines.append(table(["needed", "", "usual", "here", "because"],
+                       [[verdict[row.needed], row.what, size(row.nbytes) if row.nbytes else "",
+                         size(row.kept) if row.kept else "0" if row.nbytes else "", row.reason] for row in needs.rows],
+                       left=5))
+    return "\n".join([*lines, f"  {_saved(needs)}"])
+
+
+def _saved(needs: Needs) -> str:
+    if needs.own is None:
+        return f"nothing is to be baked: it saves {size(needs.full_nbytes)} and about {needs.full_seconds:.2g} s of " \
+               "processor time"
+    options = [f"--{name.replace('_', '-')} {','.join(v) if isinstance(v, list) else v}"
+               for name, v in needs.options.items()]
+    bake = " ".join(["bake", *options]) if options else "the usual bake"
+    return (f"{size(needs.nbytes)} in place of {size(needs.full_nbytes)}, about {needs.seconds:.2g} s of processor "
+            f"time in place of {needs.full_seconds:.2g}: {bake}")
+
+
+def _spread_text(spread: Span) -> str:
+    """A value, or its range over a texture with the mean."""
+    def one(values: Sequence[float]) -> str:
+        return f"{values[0]:.3g}" if len(set(values)) == 1 else "/".join(f"{v:.3g}" for v in values)
+
+    if spread.low == spread.high:
+        return one(spread.low)
+    mean = f", mean {one(spread.mean)}" if spread.mean else ""
+    return f"{one(spread.low)} … {one(spread.high)}{mean}"
+
+
+def _also(m: Material) -> list[str]:
+    """What else is given of a material, in words."""
+    core = ("base_color", "metalness", "roughness")
+    told = ["unlit"] if m.unlit else []
+    return told + [f"{name.replace('_', ' ')} {_spread_text(spread)}" for name, spread in m.values.items()
+                   if name not in core and spread.given != "default"]
+
+
+def scene_rows(scene: Scene, needs: Needs) -> list[dict[str, Any]]:
+    """JSON rows: the scene, a material and a need each, and the whole."""
+    def plain(x: float) -> float | None:
+        return x if math.isfinite(x) else None  # an attenuation distance
+
+    rows: list[dict[str, Any]] = [{
+        "event": "scene", "file": str(scene.path), "low": scene.low, "high": scene.high, "lights": scene.lights,
+        "cameras": [vars(camera) for camera in scene.cameras], "notices": list(scene.notices)}]
+    rows += [{"event": "material", "name": m.name, "uses": m.uses, "unlit": m.unlit, "extensions": list(m.given),
+              "values": {name: {"low": [plain(x) for x in s.low], "high": [plain(x) for x in s.high],
+                                "mean": [plain(x) for x in s.mean], "given": s.given, "seen": s.seen,
+                                **({"histogram": list(s.histogram)} if s.histogram else {})}
+                         for name, s in m.values.items()}} for m in scene.materials]
+    rows += [{"event": "need", "for": needs.engine.name, "what": row.what, "kind": row.kind, "needed": row.needed,
+              "reason": row.reason, "usual_bytes": row.nbytes, "bytes": row.kept} for row in needs.rows]
+    return [*rows, {"event": "needs", "for": needs.engine.name, "bake": needs.own is not None, "options": needs.options,
+                    "tables": list(needs.tables), "charlie": needs.cloth, "bytes": needs.nbytes,
+                    "usual_bytes": needs.full_nbytes, "predicted": {"cpu_seconds": needs.seconds,
+                                                                    "usual_cpu_seconds": needs.full_seconds}}]
+
+
+def budget_text(found: Budget, choice: Choice | None = None) -> str:
+    """What each approximation costs a scene in an environment, and what stays within a tolerance."""
+    rows = [*(e for e in found.entries if e.used), found.files, found.floor, found.whole]
+    head = [f"  errors of reflected radiance in {found.environment}, at {found.points} points of the scene's materials",
+            table(["part", "", "rms", "p95", ""], [_entry_cells(e) for e in rows], left=2),
+            f"  largest: {found.largest.name}; they do not add up; the integral is within {found.accuracy:.1g} (p99)",
+            "  other ways would change what is right by",
+            table(["", "", "rms", "p95", ""], [_entry_cells(e) for e in found.entries if not e.used], left=2)]
+    return "\n".join([*head, *_chosen_lines(found, choice)])
+
+
+def _entry_cells(e: Entry) -> list[str]:
+    what = e.kind if e.kind in ("files", "split", "model") and e.name not in ("files", "exact files") else ""
+    return [e.name, what, f"{'≤ ' if e.bound else ''}{e.rms:.2g}", f"{e.p95:.2g}", f" {e.what}"]
+
+
+def _chosen_lines(found: Budget, choice: Choice | None) -> Iterable[str]:
+    if choice is None:
+        return
+    options = " ".join(f"--{name.replace('_', '-')} {','.join(v) if isinstance(v, list) else f'{v:g}'}"
+                       if not isinstance(v, str) else f"--{name} {v}" for name, v in choice.options.items()
+                       if name != "format")
+    own = f", its chain as {choice.options['format']}" if "format" in choice.options else ""
+    if choice.met:
+        yield (f"  within {choice.tolerance:g}: bake --for {found.engine} {options}{own}: {size(choice.nbytes)} in place "
+               f"of {size(choice.usual_nbytes)}, the cheapest of its kind; its files add {choice.error:.2g}, and "
+               f"{choice.binds.name} binds ({choice.binds.rms:.2g})")
+    else:
+        yield (f"  no set of files is within {choice.tolerance:g}; the least error of {choice.tried}, {choice.error:.2g}, "
+               f"has bake --for {found.engine} {options}{own}; {choice.binds.name} binds ({choice.binds.rms:.2g})")
+    for e in choice.beyond:
+        yield f"  no choice reaches {choice.tolerance:g} of {e.name}: {e.rms:.2g} ({e.what})"
+
+
+def budget_rows(found: Budget, choice: Choice | None = None) -> list[dict[str, Any]]:
+    """JSON rows: an approximation each, the whole, and the choice."""
+    def row(e: Entry) -> dict[str, Any]:
+        return {"name": e.name, "kind": e.kind, "rms": e.rms, "p95": e.p95, "used": e.used, "bound": e.bound,
+                "what": e.what}
+
+    where = {"for": found.engine, "environment": found.environment}
+    rows: list[dict[str, Any]] = [{"event": "approximation", **where, **row(e)} for e in found.entries]
+    rows.append({"event": "budget", **where, "points": found.points, "accuracy": found.accuracy,
+                 "levels": [{"size": s, "roughness": r} for s, r in found.levels], "largest": found.largest.name,
+                 "files": row(found.files), "exact_files": row(found.floor), "whole": row(found.whole),
+                 "notices": list(found.notices)})
+    if choice is not None:
+        rows.append({"event": "choice", **where, "tolerance": choice.tolerance, "met": choice.met,
+                     "options": dict(choice.options), "bytes": choice.nbytes, "usual_bytes": choice.usual_nbytes,
+                     "error": choice.error, "whole": choice.whole, "binds": choice.binds.name,
+                     "beyond": [row(e) for e in choice.beyond], "tried": choice.tried})
+    return rows
+
+
+# ---------------------------------------------------------------------------------------------- batches
+
+
+def result_row(result: Result) -> dict[str, Any]:
+    """The JSON row of an item of a batch."""
+    row: dict[str, Any] = {"event": result.state, "kind": result.kind, "place": result.place, "name": result.name,
+                           "output": result.output}
+    if result.state == "failed":
+        return {**row, "message": result.message, "exit_code": result.exit_code}
+    row |= {"manifest": result.manifest, "files": result.files, "bytes": result.nbytes}
+    row |= {"error": result.error} if result.error is not None else {}
+    row |= {"predicted": result.predicted} if result.predicted else {}
+    return {**row, "seconds": result.seconds, "notices": list(result.notices)}
+
+
+def result_text(result: Result) -> str:
+    """One line of an item; nothing of what is up to date or failed, which the summary tells. Of a plan, its files."""
+    if result.state == "done":
+        error = "" if result.error is None else f", error {result.error:.1e}"
+        return f"{result.place}: {size(result.nbytes)}{error}, {sum(result.seconds.values()):.2f} s"
+    if result.state == "planned":
+        about = f"; about {result.predicted['cpu_seconds']:.2g} s of processor time and " \
+                f"{size(result.predicted['memory'])} of memory" if result.predicted else ""
+        return "\n".join([f"{result.place}: {len(result.files)} file{'s' if len(result.files) > 1 else ''}, "
+                          f"{size(result.nbytes)} before compression{about}",
+                          *(f"  would write {path}  {size(nbytes)}" for path, nbytes in result.files.items())])
+    return ""
+
+
+def rate_text(tally: Tally) -> str:
+    """Items a second, and failures so far."""
+    failed = f", {len(tally.failed)} failed" if tally.failed else ""
+    return f"{tally.count / max(tally.wall, 1e-9):.3g}/s{failed}"
+
+
+def failures_text(tally: Tally) -> list[str]:
+    """Every failure with its reason."""
+    return [f"failed: {result.place}: {result.message} (exit code {result.exit_code})" for result in tally.failed]
+
+
+def tally_text(tally: Tally) -> str:
+    """The last line of a batch."""
+    states = {"done": "done", "planned": "to do", "skipped": "up to date", "failed": "failed"}
+    if tally.total and tally.states["skipped"] == tally.total:
+        return f"{tally.total} items, all up to date: nothing to do; {tally.wall:.2f} s"
+    told = [f"{tally.states[state]} {text}" for state, text in states.items() if tally.states[state]]
+    left = tally.total - tally.count
+    told += [f"{left} not begun"] if left else []
+    line = f"{tally.total} items: {', '.join(told) or 'none'}; {size(tally.nbytes)}"
+    if tally.states["planned"]:
+        return line + f", about {tally.predicted['cpu_seconds']:.2g} s of processor time, " \
+                      f"{size(tally.predicted['memory'])} of memory a worker"
+    return line + f", {tally.wall:.2f} s (" + ", ".join(f"{name} {s:.2f}" for name, s in tally.seconds.items()) + ")"
+
+
+def tally_row(tally: Tally) -> dict[str, Any]:
+    """The last JSON row of a batch, with every failure."""
+    return {"event": "summary", "items": tally.total, **tally.states, "bytes": tally.nbytes, "wall": tally.wall,
+            "seconds": tally.seconds, **({"predicted": tally.predicted} if tally.states["planned"] else {}),
+            "failures": [{"place": r.place, "message": r.message, "exit_code": r.exit_code} for r in tally.failed]}

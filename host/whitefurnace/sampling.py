@@ -54,12 +54,17 @@ def sample(ndf: str | Model, count: int, *, seed: int = 0, device: Device | str 
                    for axis in "XY"]
         m = np.stack([stretch[0] * r * np.cos(phi), stretch[1] * r * np.sin(phi), np.ones(count)], 1)
         return m / np.linalg.norm(m, axis=1, keepdims=True)
-    if "NDF_SAMPLE" in entry.provides:
-        sin2 = _closed(on, entry, u, numbers, precision)
-    else:
-        sin2 = np.sin(np.interp(u, *_energy(on, entry, numbers))) ** 2
+    sin2 = quantiles(on, entry, numbers, u, precision)
     s = np.sqrt(sin2)
     return np.stack([s * np.cos(phi), s * np.sin(phi), np.sqrt(np.maximum(1 - sin2, 0))], 1)
+
+
+def quantiles(device: Device, entry: Model, numbers: np.ndarray, u: np.ndarray, precision: int = 32) -> np.ndarray:
+    """(n,) float64: sin²θ at the quantiles u of an isotropic NDF's density D(m)(n·m); `numbers` (k, 1) as kernels take
+    them."""
+    if "NDF_SAMPLE" in entry.provides:
+        return _closed(device, entry, u, numbers, precision)
+    return np.asarray(np.sin(np.interp(u, *_energy(device, entry, numbers))) ** 2)
 
 
 def _closed(device: Device, entry: Model, u: np.ndarray, numbers: np.ndarray, precision: int) -> np.ndarray:

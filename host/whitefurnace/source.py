@@ -365,9 +365,9 @@ def truth(slots: Mapping[str, Model], how: str, sets: int, area_terms: int = 0) 
     directions drawn as `how` says, for `sets` sets of numbers."""
     defines = f"#define {how}\n#define SETS {sets}\n"
     # samples.cl makes reals of what special.clh calls bits: one macro, of either.
-    return _assemble(["real.clh", "sphere.clh", ("bindings", defines + _bindings(slots, cells=(), area_terms=area_terms)),
-                      *_models(slots, area_terms), ("between", "#undef TO_REAL\n"), "pyramid.cl", "samples.cl",
-                      "truth.cl"])
+    bound = defines + _bindings(slots, cells=(), area_terms=area_terms)
+    return _assemble(["real.clh", "sphere.clh", ("bindings", bound), *_models(slots, area_terms),
+                      ("between", "#undef TO_REAL\n"), "pyramid.cl", "samples.cl", "truth.cl"])
 
 
 @_kept
