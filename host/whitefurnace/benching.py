@@ -28,6 +28,7 @@ from whitefurnace.recipe import chosen
 from whitefurnace.samples import Sampler
 from whitefurnace.sphere import Shape, latlong_tables
 from whitefurnace.texels import Texels
+from whitefurnace.truth import Points, Term, Truth, term
 
 RUNS = 7
 """Runs of a case after one that is not counted; the median stands for all."""
@@ -57,6 +58,12 @@ FLOPS: Mapping[str, float] = {
     # l 15, its face and place 20, how much higher it is read 9 and between which levels 6, two addresses 34, two
     # bilinear reads of four scalars 72, their blend and sum 20.
     "samples": 176,
+    # A normal that v sees 25, l 9, its area 10 and V 7, D 8, what is left 3 and its level 9, then as samples but for
+    # the sum 157; two Fresnels with their weights 17, the blend 12 and two sums of four 16.
+    "truth": 273,
+    # n·l 6, the half vector 9 and its cosines and slope 17, D 6, area of l 9, V 6, n·l D V 3, two Fresnels 16, three
+    # sums of each 12.
+    "truth-lights": 84,
     # Two filters of five taps 36, node 3, face coordinates 19 and their test 5, two arctangents 36, places 6 and
     # stencils 12, two bases 62, w L 3, rows 32, 256 multiply-adds 512.
     "anterpolate": 726,
@@ -324,6 +331,32 @@ def _samples(device: Device, precision: int, scale: int) -> Work:
                 pyramid.nbytes + precision / 8 * 6 * shape.count)
 
 
+def _truth(device: Device, precision: int, scale: int) -> tuple[Truth, Term, Points]:
+    """Points of a sphere under a noise, GGX at α = ¼ and Schlick's Fresnel of two F0."""
+    n = _directions(1024 * scale)
+    n[2] = np.abs(n[2])
+    return (Truth(device, _noise(64), precision),
+            term(ndf="ggx", fresnel="schlick", ndf_alpha=0.25, fresnel_f0=np.array([0.04, 1.0]), fresnel_f90=1.0),
+            Points(n, np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape)))
+
+
+def _truth_samples(device: Device, precision: int, scale: int) -> Work:
+    """256 samples a point, each between two levels."""
+    truth, found, points = _truth(device, precision, scale)
+    count = points.n.shape[1]
+    pyramid = truth.rest.pyramid(truth.rest.size)
+    return Work(lambda _: truth.sums(found, points, 256, truth.rest), 256.0 * count,
+                pyramid.nbytes + precision / 8 * count * 16)
+
+
+def _truth_lights(device: Device, precision: int, scale: int) -> Work:
+    """1 024 lights a point."""
+    truth, found, points = _truth(device, precision, scale)
+    count, lights = points.n.shape[1], np.concatenate([_directions(1024).T, _rng().random((1024, 3))], 1)
+    return Work(lambda _: truth.gathered(found, points, lights), 1024.0 * count,
+                precision / 8 * (8 * 1024 + count * 14))
+
+
 def _pyramid(device: Device, precision: int, scale: int) -> Work:
     """The pyramid of a cube."""
     size = 1 << min(4 + scale.bit_length(), 10)
@@ -546,6 +579,8 @@ CASES = (
     Case("radiance-light", "radiance_outline.cl", "evaluation", "reflected radiance of an area light", _radiance_light),
     Case("radiance-image", "radiance_nodes.cl", "node", "reflected radiance of an image's nodes", _radiance_image),
     Case("radiance-texels", "radiance_texels.cl", "node", "texels in the frame of a surface", _radiance_texels),
+    Case("truth", "truth.cl", "sample", "the reflectance integral by samples, GGX of two F0", _truth_samples),
+    Case("truth-lights", "truth.cl", "pair", "the same over a list of bright texels", _truth_lights),
     Case("evaluate", "evaluate.cl", "cell", "a model function, GGX's D", _evaluate),
     Case("demo", "demo.cl", "point", "the built-in environment", _demo, (32,)),
 )
