@@ -86,8 +86,9 @@ ALLOWED: dict[str, set[str]] = {
               "comparison"},
     "beside": {"errors", "recipe", "device", "engines", "environments", "certificate", "files", "sphere", "suns",
                "reading", "radiance", "lighting", "baking", "truth", "rendering", "plots"},
-    "budget": {"errors", "catalogue", "recipe", "device", "engines", "environments", "certificate", "files", "fitting",
-               "sphere", "harmonic", "lighting", "outputs", "reading", "rendering", "scene", "split_sum", "truth"},
+    "budget": {"errors", "baking", "catalogue", "recipe", "device", "engines", "environments", "certificate", "files",
+               "fitting", "sphere", "harmonic", "lighting", "outputs", "reading", "rendering", "scene", "split_sum",
+               "truth"},
     "report": {"errors", "catalogue", "device", "engines", "baking", "batch", "tables", "verification", "benching",
                "tradeoff", "comparison", "rendering", "beside", "scene", "needs", "budget"},
     "gallery": {"errors", "baking", "batch", "files", "report", "strips"},
@@ -112,7 +113,7 @@ DOORS: dict[str, set[str] | None] = {
     "distributed": {"pool"},
     "matplotlib": {"plots"},
     "pygltflib": {"scene"},
-    "msgspec": {"recipe", "files", "engines", "batch"},
+    "msgspec": {"recipe", "files", "engines", "batch", "budget"},
 }
 
 

@@ -58,12 +58,12 @@ FLOPS: Mapping[str, float] = {
     # l 15, its face and place 20, how much higher it is read 9 and between which levels 6, two addresses 34, two
     # bilinear reads of four scalars 72, their blend and sum 20.
     "samples": 176,
-    # A normal that v sees 25, l 9, its area 10 and V 7, D 8, what is left 3 and its level 9, then as samples but for
+    # A normal that v sees 26, l 10, its area 10 and V 7, D 8, what is left 3 and its level 9, then as samples but for
     # the sum 157; two Fresnels with their weights 17, the blend 12 and two sums of four 16.
-    "truth": 273,
-    # n·l 6, the half vector 9 and its cosines and slope 17, D 6, area of l 9, V 6, n·l D V 3, two Fresnels 16, three
+    "truth": 275,
+    # n·l 7, the half vector 9 and its cosines and slope 17, D 6, area of l 9, V 6, n·l D V 3, two Fresnels 16, three
     # sums of each 12.
-    "truth-lights": 84,
+    "truth-lights": 85,
     # Two filters of five taps 36, node 3, face coordinates 19 and their test 5, two arctangents 36, places 6 and
     # stencils 12, two bases 62, w L 3, rows 32, 256 multiply-adds 512.
     "anterpolate": 726,

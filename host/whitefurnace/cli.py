@@ -6,7 +6,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -344,11 +344,18 @@ Examples:
   whitefurnace scene helmet.glb
   whitefurnace scene helmet.glb --for filament --environment studio.hdr -o baked
   whitefurnace scene helmet.glb --for three --environment 'probes/*.exr' --job helmet.toml
+  whitefurnace scene helmet.glb --for filament --environment studio.hdr --tolerance .1
 
 \b
 FILE's materials are read with their extensions and textures: the range of each value over what the scene's triangles
 use of an image. What of ENGINE's usual bake they need is listed, and what not, each with its reason; `cannot` is what
 no table of an environment gives. -o bakes it; --job writes a job for `whitefurnace batch`.
+
+\b
+With --environment alone, or with --tolerance, the error of each approximation is measured on these materials in ENV: of
+the files, the split sum and the model, and of the engine's whole picture, against the full reflectance integral.
+--tolerance X finds the cheapest bake whose files add at most X (RMS), says what binds and what no choice reaches, and
+-o bakes that.
 
 \b
 Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported (without
@@ -364,12 +371,15 @@ pygltflib), 7 a tolerance was missed, 130 interrupted.
 @click.option("--job", metavar="JOB.toml", type=click.Path(path_type=Path),
               help="Write what is needed as a job for `whitefurnace batch`.")
 @click.option("--background", is_flag=True, help="The environment itself is seen behind the scene.")
+@click.option("--tolerance", metavar="X", type=float,
+              help="Find the cheapest bake whose files add at most X (RMS) to reflected radiance.")
 @click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
 @click.option("--force", is_flag=True, help="Bake again, and replace files that are not known to be ours.")
 @click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
 @click.option("--quiet", is_flag=True, help="Print errors only.")
 def scene(file: Path, for_: str, environments: tuple[str, ...], output: Path | None, job: Path | None,
-          background: bool, device: str | None, force: bool, as_json: bool, quiet: bool) -> None:
+          background: bool, tolerance: float | None, device: str | None, force: bool, as_json: bool,
+          quiet: bool) -> None:
     """Say what of a bake the materials of a glTF scene need, bake just that, and what it saves."""
     from whitefurnace import needs as deciding
     from whitefurnace import report
@@ -381,6 +391,9 @@ def scene(file: Path, for_: str, environments: tuple[str, ...], output: Path | N
         raise UsageError("give -o or --job, not both")
     if (output or job) and not environments:
         raise UsageError(f"{'-o' if output else '--job'} bakes an environment: give --environment ENV")
+    if tolerance is not None and (job or not environments):
+        raise UsageError("--tolerance is for one environment after another: " + (
+            "give -o DIR, a job has the same options for all" if job else "give --environment ENV"))
     engine = deciding.one_engine(named(for_))
     found = reading.read_scene(file)
     needs = deciding.needs(found, engine, background=background)
@@ -398,17 +411,43 @@ def scene(file: Path, for_: str, environments: tuple[str, ...], output: Path | N
             _json({"event": "job", "file": str(job)})
         elif not quiet:
             click.echo(f"  wrote {job}")
+    found_best: dict[str, dict[str, Any]] = {}
+    if environments and job is None and (output is None or tolerance is not None):
+        found_best = _budgets(found, needs, environments, tolerance, device, as_json, quiet)
     if output is not None:
-        _bake_needs(needs, for_, environments, output, device, force, as_json, quiet)
+        _bake_needs(needs, for_, environments, output, device, force, as_json, quiet, found_best)
+
+
+def _budgets(scene: Any, needs: Any, environments: tuple[str, ...], tolerance: float | None, device: str | None,
+             as_json: bool, quiet: bool) -> dict[str, dict[str, Any]]:
+    """Tells of each environment what approximations cost; the options of `bake` chosen, by environment."""
+    from whitefurnace import budget, report
+
+    best = {}
+    for name in environments:
+        measured, choice = budget.of_image(scene, name, needs.engine, tolerance, device, needs.without)
+        if choice is not None:
+            best[name] = {key: value for key, value in choice.options.items() if key != "format"}
+        for notice in () if quiet else measured.notices:
+            _say(f"notice: {measured.environment}: {notice}")
+        for row in report.budget_rows(measured, choice) if as_json else ():
+            _json(row)
+        if not as_json and not quiet:
+            click.echo(report.budget_text(measured, choice))
+    return best
 
 
 def _bake_needs(needs: Any, for_: str, environments: tuple[str, ...], output: Path, device: str | None, force: bool,
-                as_json: bool, quiet: bool) -> None:
+                as_json: bool, quiet: bool, best: Mapping[str, dict[str, Any]]) -> None:
     from whitefurnace import baking, report, tables
     from whitefurnace import needs as deciding
 
-    orders = [(Path(folder), baking.order(environments, folder, for_=for_, force=force, **options))
-              for one in deciding.bakes(needs, str(output)) for folder, options in [(one.pop("output"), one)]]
+    orders = []
+    for k, one in enumerate(deciding.bakes(needs, str(output))):
+        folder = one.pop("output")
+        for some in [(name,) for name in environments] if best and k == 0 else [environments]:
+            options = best[some[0]] if best and k == 0 else one
+            orders.append((Path(folder), baking.order(some, folder, for_=for_, force=force, **options)))
     with _progress(not (quiet or as_json)) as tell:
         for folder, order in orders:
             for k, name in enumerate(order.names):

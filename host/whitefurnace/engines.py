@@ -250,8 +250,9 @@ _PRESETS = (
                "const faces = [0, 1, 2, 3, 4, 5].map(f => ({ width: mipmaps[0].width, height: mipmaps[0].height, "
                "mipmaps: mipmaps.map(({ data, width, height }) => ({ width, height, "
                "data: data.subarray(f * data.length / 6, (f + 1) * data.length / 6) })) }))",
-               "texture = new CompressedCubeTexture(faces, format, type); texture.magFilter = LinearFilter; "
-               "texture.minFilter = LinearMipmapLinearFilter; texture.isPMREMTexture = true; texture.needsUpdate = true",
+               "texture = new CompressedCubeTexture(faces, format, type); texture.minFilter = "
+               "LinearMipmapLinearFilter; texture.magFilter = LinearFilter; texture.isPMREMTexture = true; "
+               "texture.needsUpdate = true",
                "scene.environment = texture; its last level is the diffuse light too",
                "before r187: scene.environment = the texture of RGBELoader for STEM.hdr, which it filters itself"),
     ),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -196,10 +197,13 @@ def draw_beside(path: Path, pictures: Sequence[np.ndarray], difference: np.ndarr
     from matplotlib.figure import Figure
 
     high, wide = difference.shape
-    head, foot, gap, bar, dpi = 34, 16 + 16 * len(caption), 12, 84, 100
+    head, gap, bar, dpi = 34, 12, 84, 100
     below = wide > 1.5 * high
     columns, rows = (1, 3) if below else (3, 1)
     width = max(columns * wide + (columns + 1) * gap + bar, 460)
+    # A letter of 9 points is 6.5 pixels wide on average.
+    caption = [part for line in caption for part in textwrap.wrap(line, int((width - 2 * gap) / 6.5))]
+    foot = 16 + 16 * len(caption)
     height = rows * (high + head) + gap + foot
     with matplotlib.rc_context():
         matplotlib.rcdefaults()

@@ -59,10 +59,10 @@ def shade(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, base_col
     """(m, 3) linear radiance towards v of points with normals n, both unit vectors (3, m) of the world with n·v > 0,
     lit by the environment alone.
 
-    `base_color` (3,) or (m, 3), `metalness` and perceptual `roughness` numbers or (m,), all in [0, 1]; `insulator` is F0
-    of what is no metal, a number or (m, 3). What is read,
-    where, and how it is weighed is the engine's: lod(r), direction, axes, seamless trilinear reads, its irradiance, its
-    table bilinearly on its own axes, its way of keeping energy (`SHADINGS`). Everything is linear in what is stored.
+    `base_color` (3,) or (m, 3), `metalness` and perceptual `roughness` numbers or (m,), all in [0, 1]; `insulator` is
+    F0 of what is no metal, a number or (m, 3). What is read, where, and how it is weighed is the engine's: lod(r),
+    direction, axes, seamless trilinear reads, its irradiance, its table bilinearly on its own axes, its way of keeping
+    energy (`SHADINGS`). Everything is linear in what is stored.
     """
     m = n.shape[1]
     r = np.maximum(np.broadcast_to(np.asarray(roughness, np.float64), (m,)), engine.least)

@@ -658,16 +658,16 @@ def budget_text(found: Budget, choice: Choice | None = None) -> str:
     """What each approximation costs a scene in an environment, and what stays within a tolerance."""
     rows = [*(e for e in found.entries if e.used), found.files, found.floor, found.whole]
     head = [f"  errors of reflected radiance in {found.environment}, at {found.points} points of the scene's materials",
-            table(["part", "", "rms", "p95", ""], [_entry_cells(e) for e in rows], left=2),
+            table(["part", "", "rms", "p95", ""], [_entry_cells(e) for e in rows], left=5),
             f"  largest: {found.largest.name}; they do not add up; the integral is within {found.accuracy:.1g} (p99)",
             "  other ways would change what is right by",
-            table(["", "", "rms", "p95", ""], [_entry_cells(e) for e in found.entries if not e.used], left=2)]
+            table(["", "", "rms", "p95", ""], [_entry_cells(e) for e in found.entries if not e.used], left=5)]
     return "\n".join([*head, *_chosen_lines(found, choice)])
 
 
 def _entry_cells(e: Entry) -> list[str]:
     what = e.kind if e.kind in ("files", "split", "model") and e.name not in ("files", "exact files") else ""
-    return [e.name, what, f"{'≤ ' if e.bound else ''}{e.rms:.2g}", f"{e.p95:.2g}", f" {e.what}"]
+    return [e.name, what, f"{'≤ ' if e.bound else ''}{e.rms:.2g}", f"{e.p95:.2g}", e.what]
 
 
 def _chosen_lines(found: Budget, choice: Choice | None) -> Iterable[str]:
@@ -678,12 +678,13 @@ def _chosen_lines(found: Budget, choice: Choice | None) -> Iterable[str]:
                        if name != "format")
     own = f", its chain as {choice.options['format']}" if "format" in choice.options else ""
     if choice.met:
-        yield (f"  within {choice.tolerance:g}: bake --for {found.engine} {options}{own}: {size(choice.nbytes)} in place "
-               f"of {size(choice.usual_nbytes)}, the cheapest of its kind; its files add {choice.error:.2g}, and "
+        yield (f"  cheapest within {choice.tolerance:g}: bake --for {found.engine} {options}{own}: "
+               f"{size(choice.nbytes)} in place of {size(choice.usual_nbytes)}; its files add {choice.error:.2g}, and "
                f"{choice.binds.name} binds ({choice.binds.rms:.2g})")
     else:
-        yield (f"  no set of files is within {choice.tolerance:g}; the least error of {choice.tried}, {choice.error:.2g}, "
-               f"has bake --for {found.engine} {options}{own}; {choice.binds.name} binds ({choice.binds.rms:.2g})")
+        yield (f"  none of {choice.tried} sets of files is within {choice.tolerance:g}; the least error, "
+               f"{choice.error:.2g}, has bake --for {found.engine} {options}{own}; {choice.binds.name} binds "
+               f"({choice.binds.rms:.2g})")
     for e in choice.beyond:
         yield f"  no choice reaches {choice.tolerance:g} of {e.name}: {e.rms:.2g} ({e.what})"
 

@@ -60,8 +60,8 @@ PAPERS = {
                       "JCGT 14(1), 2025",
     "Ramamoorthi2001": "R. Ramamoorthi, P. Hanrahan, An Efficient Representation for Irradiance Environment Maps, "
                        "SIGGRAPH 2001",
-    "Reinhard2002": "E. Reinhard, M. Stark, P. Shirley, J. Ferwerda, Photographic Tone Reproduction for Digital Images, "
-                    "ACM TOG 21(3), 2002",
+    "Reinhard2002": "E. Reinhard, M. Stark, P. Shirley, J. Ferwerda, Photographic Tone Reproduction for Digital Images,"
+                    " ACM TOG 21(3), 2002",
     "Schlick1994": "C. Schlick, An Inexpensive BRDF Model for Physically-Based Rendering, CGF 13(3), 1994",
     "Shirley1997": "P. Shirley et al., A Practitioners' Assessment of Light Reflection Models, Pacific Graphics 1997",
     "Snyder1996": "J. Snyder, Area Light Sources for Real-Time Graphics, Microsoft Research MSR-TR-96-11, 1996",
