@@ -345,6 +345,7 @@ Examples:
   whitefurnace scene helmet.glb --for filament --environment studio.hdr -o baked
   whitefurnace scene helmet.glb --for three --environment 'probes/*.exr' --job helmet.toml
   whitefurnace scene helmet.glb --for filament --environment studio.hdr --tolerance .1
+  whitefurnace scene helmet.glb --pixel 0.5mm --medium rubber:skin1
 
 \b
 FILE's materials are read with their extensions and textures: the range of each value over what the scene's triangles
@@ -356,6 +357,12 @@ With --environment alone, or with --tolerance, the error of each approximation i
 the files, the split sum and the model, and of the engine's whole picture, against the full reflectance integral.
 --tolerance X finds the cheapest bake whose files add at most X (RMS), says what binds and what no choice reaches, and
 -o bakes that.
+
+\b
+--pixel, --resolution or --medium tell what each medium inside asks for: whether absorption is seen over the size of the
+object, and whether light leaves within a pixel of where it entered; where not, -o and --job have the table of
+`whitefurnace lut diffusion`. MEDIUM is the name of a measured one (skin1, marble, wholemilk, water, ...), or σa and σs
+per mm, R/G/B or one number, as σa=.03/.17/.48,σs=.74/.88/1.01,g=0,ior=1.3, or distance=1cm,color=.9/.5/.1 for σa.
 
 \b
 Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported (without
@@ -371,6 +378,11 @@ pygltflib), 7 a tolerance was missed, 130 interrupted.
 @click.option("--job", metavar="JOB.toml", type=click.Path(path_type=Path),
               help="Write what is needed as a job for `whitefurnace batch`.")
 @click.option("--background", is_flag=True, help="The environment itself is seen behind the scene.")
+@click.option("--pixel", metavar="LENGTH", help="What a pixel covers of the object, as 0.5mm.")
+@click.option("--resolution", metavar="HEIGHT", type=int,
+              help="Or that of an image of so many rows by the scene's camera that comes closest.")
+@click.option("--medium", "media", metavar="[MATERIAL:]MEDIUM", multiple=True,
+              help="What is inside of a material, or of the scene. [default: as KHR_materials_volume has it]")
 @click.option("--tolerance", metavar="X", type=float,
               help="Find the cheapest bake whose files add at most X (RMS) to reflected radiance.")
 @click.option("--device", metavar="NAME", help="A number or part of a name from `whitefurnace devices`.")
@@ -378,9 +390,11 @@ pygltflib), 7 a tolerance was missed, 130 interrupted.
 @click.option("--json", "as_json", is_flag=True, help="JSON Lines on stdout, and nothing else there.")
 @click.option("--quiet", is_flag=True, help="Print errors only.")
 def scene(file: Path, for_: str, environments: tuple[str, ...], output: Path | None, job: Path | None,
-          background: bool, tolerance: float | None, device: str | None, force: bool, as_json: bool,
-          quiet: bool) -> None:
+          background: bool, pixel: str | None, resolution: int | None, media: tuple[str, ...],
+          tolerance: float | None, device: str | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Say what of a bake the materials of a glTF scene need, bake just that, and what it saves."""
+    from dataclasses import replace
+
     from whitefurnace import needs as deciding
     from whitefurnace import report
     from whitefurnace import scene as reading
@@ -397,13 +411,18 @@ def scene(file: Path, for_: str, environments: tuple[str, ...], output: Path | N
     engine = deciding.one_engine(named(for_))
     found = reading.read_scene(file)
     needs = deciding.needs(found, engine, background=background)
+    scaled = pixel is not None or resolution is not None or bool(media)
+    inside, covered = _inside(found, pixel, resolution, media) if scaled else ((), None)
+    needs = replace(needs, tables=(*needs.tables, *(one.table for one in inside if one.table is not None)))
     for notice in () if quiet else found.notices:
         _say(f"notice: {file.name}: {notice}")
-    for row in report.scene_rows(found, needs) if as_json else ():
+    for row in [*report.scene_rows(found, needs), *report.media_rows(inside, covered)] if as_json else ():
         _json(row)
     if not as_json and not quiet:
         click.echo(report.scene_text(found, needs))
-    if needs.own is None:
+        if scaled:
+            click.echo(report.media_text(inside, covered))
+    if needs.own is None and not needs.tables:
         return
     if job is not None:
         deciding.write_job(job, needs, for_, file.name, environments, force=force)
@@ -412,10 +431,18 @@ def scene(file: Path, for_: str, environments: tuple[str, ...], output: Path | N
         elif not quiet:
             click.echo(f"  wrote {job}")
     found_best: dict[str, dict[str, Any]] = {}
-    if environments and job is None and (output is None or tolerance is not None):
+    if environments and needs.own and job is None and (output is None or tolerance is not None):
         found_best = _budgets(found, needs, environments, tolerance, device, as_json, quiet)
     if output is not None:
         _bake_needs(needs, for_, environments, output, device, force, as_json, quiet, found_best)
+
+
+def _inside(scene: Any, pixel: str | None, rows: int | None, named: tuple[str, ...]) -> tuple[Any, Any]:
+    """What media ask for at a scale, and what a pixel covers."""
+    from whitefurnace import media
+
+    covered = media.pixel_of(scene, pixel, rows)
+    return media.inside(scene, covered, media.named_media(named, scene)), covered
 
 
 def _budgets(scene: Any, needs: Any, environments: tuple[str, ...], tolerance: float | None, device: str | None,
@@ -441,6 +468,7 @@ def _bake_needs(needs: Any, for_: str, environments: tuple[str, ...], output: Pa
                 as_json: bool, quiet: bool, best: Mapping[str, dict[str, Any]]) -> None:
     from whitefurnace import baking, report, tables
     from whitefurnace import needs as deciding
+    from whitefurnace.errors import FileError
 
     orders = []
     for k, one in enumerate(deciding.bakes(needs, str(output))):
@@ -458,6 +486,11 @@ def _bake_needs(needs: Any, for_: str, environments: tuple[str, ...], output: Pa
                     _json(row)
                 if not as_json and not quiet:
                     click.echo(report.baked_text(baked, folder))
+        if needs.tables and not orders:  # tables alone: no bake has made the folder
+            try:
+                output.mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise FileError(f"cannot make {output}: {error.strerror or error}") from error
         for one in needs.tables:
             options = {key: value for key, value in one.items() if key not in ("kind", "output", "set")}
             request = tables.order(one["kind"], output / one["output"], force=force,
@@ -683,6 +716,7 @@ Examples:
   whitefurnace render baked/demo.json --for three -o gold.png --base-color 1 .78 .34 --rows 1 --exposure -1
   whitefurnace render baked/demo.json --for filament -o beside.png --truth demo --multiscatter
   whitefurnace render baked/demo.json --for filament -o layers.exr --truth demo --light punctual:NoL=.5,color=2
+  whitefurnace render baked/demo.json --for filament -o helmet.png --scene helmet.glb
 
 \b
 MANIFEST is the STEM.json of a bake. Roughness goes from 0 to 1 across, metalness from 0 to 1 down (one row: 1). The
@@ -694,6 +728,10 @@ With --truth, the image that the bake was made of, there are three panels: what 
 integral of the same pixels, and their difference over the truth. An .exr holds them as layers of float32, in linear
 radiance. A light's place and directions are in the frame of the viewer (+z to the viewer, +x right), in radii of a
 sphere about its middle; lights are added to both pictures alike.
+
+\b
+With --scene there is a sphere for each of a glTF's materials (at most 64), in the order of the file and with the mean
+of what its textures have in use, --columns to a row. What a sphere leaves out of its material is a notice.
 
 \b
 Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported (an engine that
@@ -709,8 +747,10 @@ is given no prefiltered chain), 130 interrupted.
               help="Whose files are read, and who is followed in how they are shaded: one that the bake was for.")
 @click.option("--size", type=int, default=128, show_default=True, help="Pixels a sphere's cell, 8 to 2048.")
 @click.option("--columns", type=int, default=7, show_default=True, help="Spheres across, roughness 0 to 1.")
-@click.option("--rows", type=int, default=3, show_default=True, help="Spheres down, metalness 0 to 1.")
-@click.option("--base-color", metavar="R G B", type=float, nargs=3, default=(1.0, 1.0, 1.0), help="[default: 1 1 1]")
+@click.option("--rows", type=int, help="Spheres down, metalness 0 to 1. [default: 3]")
+@click.option("--base-color", metavar="R G B", type=float, nargs=3, help="[default: 1 1 1]")
+@click.option("--scene", metavar="FILE", type=click.Path(path_type=Path),
+              help="A .glb or .gltf: a sphere for each of its materials in place of the grid.")
 @click.option("--background", metavar="environment|plain", default="environment", show_default=True)
 @click.option("--exposure", metavar="EV", type=float, default=0.0, help="Multiply radiance by 2^EV.")
 @click.option("--truth", metavar="ENV", help="The image of the bake: draw the full integral beside it.")
@@ -730,8 +770,8 @@ is given no prefiltered chain), 130 interrupted.
 @click.option("--force", is_flag=True, help="Replace FILE where it is there.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON row on stdout.")
 def render(manifest: Path, output: Path, truth: str | None, as_json: bool, **options: Any) -> None:
-    """Draw a grid of spheres from the files that a bake made for an engine, shaded as that engine does, and beside it
-    the truth."""
+    """Draw a grid of spheres, or a scene's materials, from the files that a bake made for an engine, shaded as that
+    engine does, and beside it the truth."""
     from whitefurnace import rendering, report
     from whitefurnace.errors import UsageError
 

@@ -1,4 +1,5 @@
-"""A grid of spheres, roughness across and metalness down, shaded from an engine's own files as that engine does it."""
+"""Spheres, of roughness across and metalness down or of a scene's materials, shaded from an engine's own files as that
+engine does it."""
 from __future__ import annotations
 
 import math
@@ -27,9 +28,7 @@ from whitefurnace.files import (
 )
 from whitefurnace.files.texture import upright
 from whitefurnace.reading import bilinear
-
-DIELECTRIC = 0.04
-"""F0 of what is no metal, of an index of 1.5, in every engine here."""
+from whitefurnace.swatches import DIELECTRIC, Laid, in_range, laid, of_grid
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ def shade(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, base_col
     lit by the environment alone.
 
     `base_color` (3,) or (m, 3), `metalness` and perceptual `roughness` numbers or (m,), all in [0, 1]; `insulator` is
-    F0 of what is no metal, a number or (m, 3). What is read, where, and how it is weighed is the engine's: lod(r),
-    direction, axes, seamless trilinear reads, its irradiance, its table bilinearly on its own axes, its way of keeping
-    energy (`SHADINGS`). Everything is linear in what is stored.
+    F0 of what is no metal, a number, (3,) or (m, 3). What is read, where, and how it is weighed is the engine's:
+    lod(r), direction, axes, seamless trilinear reads, its irradiance, its table bilinearly on its own axes, its way of
+    keeping energy (`SHADINGS`). Everything is linear in what is stored.
     """
     m = n.shape[1]
     r = np.maximum(np.broadcast_to(np.asarray(roughness, np.float64), (m,)), engine.least)
@@ -382,7 +381,6 @@ def dictionary(value: Any) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------------- picture
 
 SIZE_RANGE = (8, 2048)
-COUNT_RANGE = (1, 64)
 MOST_PIXELS = 1 << 26
 EXPOSURES = 64.0
 RADIUS = 0.45
@@ -397,7 +395,8 @@ GREY = 0.18
 
 @dataclass(frozen=True)
 class Rendered:
-    """A picture that was written: `roughness` of its columns and `metalness` of its rows."""
+    """A picture that was written: `roughness` of its columns and `metalness` of its rows, or, of a scene, `materials`:
+    each one's name, row and column, and what its sphere is made of."""
 
     path: Path
     engine: str
@@ -408,6 +407,7 @@ class Rendered:
     exposure: float
     read: tuple[str, ...]
     notices: tuple[str, ...]
+    materials: tuple[dict[str, object], ...] = ()
 
 
 def sphere(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -429,15 +429,17 @@ def grid(engine: Engine, lights: Lights, *, columns: int = 7, rows: int = 3, siz
          base_color: Sequence[float] = (1.0, 1.0, 1.0), background: str = "environment") -> np.ndarray:
     """(rows · size, columns · size, 3) linear radiance: spheres of roughness 0 … 1 from left to right and metalness
     0 … 1 from the top down (1 where there is one row), seen along -z, over the image itself or a plain grey."""
-    for what, value, (low, high) in (("size", size, SIZE_RANGE), ("columns", columns, COUNT_RANGE),
-                                     ("rows", rows, COUNT_RANGE)):
-        if not low <= value <= high:
-            raise UsageError(f"{what} {value} is outside [{low}, {high}]")
+    return drawn(engine, lights, of_grid(columns, rows, base_color), size=size, background=background)
+
+
+def drawn(engine: Engine, lights: Lights, spheres: Laid, *, size: int = 128,
+          background: str = "environment") -> np.ndarray:
+    """(rows · size, columns · size, 3) linear radiance of spheres row by row, as `grid`; where the last row has fewer,
+    the rest is background."""
+    columns, rows = spheres.columns, spheres.rows
+    in_range("size", size, SIZE_RANGE)
     if columns * rows * size * size > MOST_PIXELS:
         raise UsageError(f"{columns} × {rows} spheres of {size} pixels are more than {MOST_PIXELS} pixels")
-    color = np.asarray(base_color, np.float64)
-    if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
-        raise UsageError(f"base color {' '.join(f'{c:g}' for c in color.ravel())} is not three numbers in [0, 1]")
     if background not in ("environment", "plain"):
         raise UsageError(f"background {background!r} is neither environment nor plain")
     index, cover, n = sphere(size)
@@ -446,16 +448,12 @@ def grid(engine: Engine, lights: Lights, *, columns: int = 7, rows: int = 3, siz
     for i in range(rows):
         band = slice(i * size, (i + 1) * size)
         picture[band] = _behind(engine, lights, picture.shape, band) if background == "environment" else GREY
-        for j in range(columns):
+        for j, of in enumerate(spheres.swatches[i * columns:(i + 1) * columns]):
             cell = picture[band, j * size:(j + 1) * size].reshape(-1, 3)  # a copy
-            lit = shade(engine, lights, n, v, color, steps(rows, 1.0)[i], steps(columns, 0.0)[j])
+            lit = shade(engine, lights, n, v, of.base_color, of.metalness, of.roughness, np.asarray(of.insulator))
             cell[index] += (lit - cell[index]) * cover[:, None]
             picture[band, j * size:(j + 1) * size] = cell.reshape(size, size, 3)
     return picture
-
-
-def steps(count: int, alone: float) -> tuple[float, ...]:
-    return tuple(float(x) for x in np.linspace(0, 1, count)) if count > 1 else (alone,)
 
 
 def camera(shape: tuple[int, ...], band: slice = slice(None)) -> np.ndarray:
@@ -481,12 +479,14 @@ def srgb(linear: np.ndarray) -> np.ndarray:
 
 
 def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, for_: str, size: int = 128,
-           columns: int = 7, rows: int = 3, exposure: float = 0.0, base_color: Sequence[float] = (1.0, 1.0, 1.0),
-           background: str = "environment", force: bool = False) -> Rendered:
+           columns: int = 7, rows: int | None = None, exposure: float = 0.0,
+           base_color: Sequence[float] | None = None, background: str = "environment",
+           scene: str | os.PathLike[str] | None = None, force: bool = False) -> Rendered:
     """Draw the spheres of a bake for one engine into a PNG, in sRGB: radiance times 2^exposure, clipped at 1.
 
+    rows: 3 by default, and base_color 1 1 1: of the grid alone. scene: a glTF whose materials are drawn in its place.
     Raises UsageError for what is out of its range or an engine that was not baked for, FileError, InputError and
-    UnsupportedError as `engine_in` and `read_lights` do.
+    UnsupportedError as `engine_in`, `read_lights` and `read_scene` do.
     """
     output = Path(output)
     if output.suffix.lower() != ".png":
@@ -497,7 +497,8 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         raise FileError(f"{output} exists; --force replaces it")
     engine, folder, stem = engine_in(manifest, for_)
     lights = read_lights(engine, folder, stem)
-    picture = grid(engine, lights, columns=columns, rows=rows, size=size, base_color=base_color, background=background)
+    spheres = laid(scene, columns, rows, base_color)
+    picture = drawn(engine, lights, spheres, size=size, background=background)
     write_png(output, srgb(picture * 2.0**exposure))
-    return Rendered(output, engine.name, picture.shape[1], picture.shape[0], steps(columns, 0.0), steps(rows, 1.0),
-                    exposure, lights.read, lights.notices)
+    return Rendered(output, engine.name, picture.shape[1], picture.shape[0], spheres.roughness, spheres.metalness,
+                    exposure, lights.read, (*lights.notices, *spheres.notices), spheres.placed())

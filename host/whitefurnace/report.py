@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from whitefurnace.comparison import Comparison
     from whitefurnace.device import Candidate
     from whitefurnace.engines import Engine
+    from whitefurnace.media import Inside, Pixel
     from whitefurnace.needs import Needs
     from whitefurnace.rendering import Rendered
     from whitefurnace.scene import Material, Scene
@@ -154,6 +155,9 @@ def planned_text(baked: Baked) -> str:
              table(["", "size", "r", "source grid a face", "lobe evaluations", "nodes a texel"], rows)]
     for path, nbytes in zip(baked.files, baked.nbytes, strict=True):
         lines.append(f"  would write {path}  {size(nbytes)} before compression")
+    if baked.programs:
+        lines.append(f"  would compile {len(baked.programs)} kernel programs of {size(sum(p.nbytes for p in baked.programs))} "
+                     "of text; --json has it")
     return "\n".join([*lines, *as_read_lines(baked.as_read)])
 
 
@@ -184,6 +188,7 @@ def baked_rows(baked: Baked) -> list[dict[str, Any]]:
         rows += [{"event": "level", "name": baked.name, "level": k, "for": list(names), "size": p.size,
                   "roughness": p.roughness, "grid": p.grid, "samples": p.samples, "pairs": p.pairs, "cuts": p.cuts}
                  for k, (names, p) in enumerate(baked.plan, _first(baked.manifest))]
+        rows += [{"event": "kernel", "name": baked.name, **program.data()} for program in baked.programs]
     else:
         rows += [{"event": "level", "name": baked.name, "level": k, **row}
                  for k, row in enumerate(baked.levels, _first(baked.manifest))]
@@ -551,14 +556,28 @@ def compared_rows(found: Comparison) -> list[dict[str, Any]]:
 
 
 def rendered_row(made: Rendered) -> dict[str, Any]:
-    return {"event": "rendered", **vars(made), "path": str(made.path)}
+    row = {"event": "rendered", **vars(made), "path": str(made.path)}
+    if not made.materials:
+        del row["materials"]
+    return row
 
 
 def rendered_text(made: Rendered) -> str:
     columns, rows = (" ".join(f"{x:.3g}" for x in values) for values in (made.roughness, made.metalness))
+    of = [f"  across  roughness {columns}", f"  down    metalness {rows}"]
+    if made.materials:
+        of = [table(["material", "row", "column", "base colour", "metalness", "roughness", "F0"],
+                    [[str(one["name"]), *(_values(one[key]) for key in ("row", "column", "base_color", "metalness",
+                                                                       "roughness", "f0"))]
+                     for one in made.materials])]
     return "\n".join([f"{made.path}: {made.width} × {made.height} pixels, {made.engine}, exposure {made.exposure:g}",
-                      f"  across  roughness {columns}", f"  down    metalness {rows}",
-                      *(f"  read    {path}" for path in made.read)])
+                      *of, *(f"  read    {path}" for path in made.read)])
+
+
+def _values(value: Any) -> str:
+    """Of one number, or of RGB, once where they are the same."""
+    values = value if isinstance(value, tuple) else (value,)
+    return " ".join(f"{x:.3g}" for x in (values[:1] if len(set(values)) == 1 else values))
 
 
 def beside_row(made: Beside) -> dict[str, Any]:
@@ -652,6 +671,24 @@ def scene_rows(scene: Scene, needs: Needs) -> list[dict[str, Any]]:
                     "tables": list(needs.tables), "charlie": needs.cloth, "bytes": needs.nbytes,
                     "usual_bytes": needs.full_nbytes, "predicted": {"cpu_seconds": needs.seconds,
                                                                     "usual_cpu_seconds": needs.full_seconds}}]
+
+
+def media_text(found: Sequence[Inside], pixel: Pixel | None) -> str:
+    """What the media of a scene ask for at its scale."""
+    lines = [f"  inside, where {pixel.text}:" if pixel else "  inside:"]
+    if not found:
+        lines.append("    no material has a volume: give --medium [MATERIAL:]MEDIUM")
+    for one in found:
+        lines += [f"    {one.head}", *(f"      {line}" for line in one.lines)]
+    return "\n".join(lines)
+
+
+def media_rows(found: Sequence[Inside], pixel: Pixel | None) -> list[dict[str, Any]]:
+    """JSON rows: a medium each."""
+    of = {"camera": pixel.of or None} if pixel else {}
+    return [{"event": "medium", "material": one.material or None, "size_of": one.size_of or None,
+             "reason": one.reason or None, "table": one.table, **of,
+             **(one.judgement.data() if one.judgement else {"subsurface": False})} for one in found]
 
 
 def budget_text(found: Budget, choice: Choice | None = None) -> str:
