@@ -35,6 +35,7 @@ from whitefurnace.files import (
 from whitefurnace.lighting import Filtered, Lighting, Want, light
 from whitefurnace.outputs import Made, Target, targets
 from whitefurnace.plan import LevelPlan, plan_chain
+from whitefurnace.programs import Program, programs
 from whitefurnace.reading import Reader, compared
 from whitefurnace.recipe import DFG_SIZE, IRRADIANCE_SIZE, TOLERANCE_RANGE, Chain, Chosen, chain, chosen, is_number
 from whitefurnace.run import Integrated, dfg
@@ -85,6 +86,8 @@ class Baked:
     seconds: float = 0.0
     as_read: tuple[dict[str, Any], ...] = ()
     """What an engine shows of the chain (reading.AsRead.data): of this one, or in a plan of what could be had too."""
+    programs: tuple[Program, ...] = ()
+    """Of a plan, the kernel programs that it compiles to."""
 
 
 @dataclass(frozen=True)
@@ -405,7 +408,7 @@ def _read(request: Order, k: int, device: Device | str | None, lock: Lock | None
     if lock is None:
         shown, notices = _would_read(request, env, device, on)
         return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, (*env.notices, *notices),
-                     as_read=shown)
+                     as_read=shown, programs=_programs(request, env))
     lock.note([*files, path, path.with_name(f"{name}.probe")])
     for folder in sorted({request.output, *(file.parent for file in files)}):
         _check_writable(folder, name)
@@ -558,6 +561,16 @@ def _rows_of(request: Order, lit: Lighting, of: Sequence[tuple[int, int]],
                 found[id(level)] = (level, k, old[2], names)
     # From large to small and smooth to rough: each engine's are then in the order of its levels.
     return sorted(found.values(), key=lambda row: (row[2] == "charlie", -row[0].texels.shape[-2], row[0].roughness))
+
+
+def _programs(request: Order, env: Environment) -> tuple[Program, ...]:
+    """The kernel programs of a bake."""
+    wants, _ = _wanted(request)
+    texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
+    # What no engine has at all is made of no program.
+    chains = [want.recipe for want in wants if (want.cubes, want.latlongs, want.octahedral) != (0, 0, 0)]
+    charlie = any(engine.dfg.charlie and engine.holding("dfg") for engine in request.engines)
+    return programs(chains or [wants[0].recipe], env.kind, texel, demo=env.name == DEMO, charlie=charlie)
 
 
 def planned_levels(request: Order, texel: float) -> tuple[tuple[tuple[str, ...], LevelPlan], ...]:

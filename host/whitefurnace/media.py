@@ -1,5 +1,5 @@
-"""What the media inside a scene's materials ask for at the scale that they are seen at: how far light goes through them,
-how much of the image a pixel is, and the table of pre-integrated diffusion where local diffuse is wrong."""
+"""What the media inside a scene's materials ask for at the scale that they are seen at: what size light crosses, what a
+pixel covers, and the table of pre-integrated diffusion where local diffuse is wrong."""
 from __future__ import annotations
 
 import math
@@ -69,9 +69,10 @@ class Pixel:
 
 
 def named_media(texts: Sequence[str], scene: Scene) -> dict[str, Medium]:
-    """Media of `[MATERIAL:]MEDIUM` by material, "" for the scene as a whole. MEDIUM is a name of scale.MEDIA, or numbers
-    as `σa=.03/.17/.48,σs=.74/.88/1.01,g=0,ior=1.3` per mm, one or three of each, or `distance=0.1m,color=.9/.5/.1` as
-    KHR_materials_volume has them in place of σa. Without an ior the material's is taken. Raises UsageError."""
+    """Media of `[MATERIAL:]MEDIUM` by material, "" for the scene as a whole. MEDIUM is a name of scale.MEDIA, or
+    numbers as `σa=.03/.17/.48,σs=.74/.88/1.01,g=0,ior=1.3` per mm, one or three of each, or
+    `distance=0.1m,color=.9/.5/.1` as KHR_materials_volume has them in place of σa. Without an ior the material's is
+    taken. Raises UsageError."""
     found: dict[str, Medium] = {}
     names = [m.name for m in scene.materials]
     for text in texts:
@@ -112,10 +113,10 @@ def _numbers(text: str, rest: str, own: Material | None) -> Medium:
         return _number(text, name, given[name]) if name in given else usual
 
     per_metre = _per_metre(triple("scattering", 0.0))
-    rest_of = {"g": one("g", 0.0), "ior": one("ior", 1.5 if own is None else _ior(own))}
+    g, ior = one("g", 0.0), one("ior", 1.5 if own is None else _ior(own))
     if "distance" in given:
-        return Medium.of_volume(length(given["distance"]), triple("color", 1.0), scattering=per_metre, **rest_of)
-    return Medium(_per_metre(triple("absorption", 0.0)), per_metre, **rest_of)
+        return Medium.of_volume(length(given["distance"]), triple("color", 1.0), scattering=per_metre, g=g, ior=ior)
+    return Medium(_per_metre(triple("absorption", 0.0)), per_metre, g, ior)
 
 
 def _number(text: str, name: str, value: str) -> float:
@@ -134,8 +135,8 @@ def _per_metre(values: Triple) -> Triple:
 
 
 def pixel_of(scene: Scene, text: str | None = None, rows: int | None = None) -> Pixel | None:
-    """What a pixel covers: as `text` says (0.5mm), or in an image of `rows` rows of the camera of the scene that sees the
-    object largest; None without either. Raises UsageError."""
+    """What a pixel covers: as `text` says (0.5mm), or in an image of `rows` rows of the camera that sees the scene
+    largest; None without either. Raises UsageError."""
     if text is not None and rows is not None:
         raise UsageError("give --pixel or --resolution, not both")
     if text is not None:
@@ -171,8 +172,8 @@ def _distance(scene: Scene, position: np.ndarray) -> float:
 
 
 def inside(scene: Scene, pixel: Pixel | None, media: dict[str, Medium]) -> tuple[Inside, ...]:
-    """What each medium asks for: those of `media`, and of KHR_materials_volume in materials that have none there. Raises
-    UsageError."""
+    """What each medium asks for: those of `media`, and of KHR_materials_volume in materials that have none there.
+    Raises UsageError."""
     found = []
     for m in scene.materials:
         if m.name in media or m.has("volume"):

@@ -156,8 +156,8 @@ def planned_text(baked: Baked) -> str:
     for path, nbytes in zip(baked.files, baked.nbytes, strict=True):
         lines.append(f"  would write {path}  {size(nbytes)} before compression")
     if baked.programs:
-        lines.append(f"  would compile {len(baked.programs)} kernel programs of {size(sum(p.nbytes for p in baked.programs))} "
-                     "of text; --json has it")
+        text = size(sum(program.nbytes for program in baked.programs))
+        lines.append(f"  would compile {len(baked.programs)} kernel programs of {text} of text; --json has it")
     return "\n".join([*lines, *as_read_lines(baked.as_read)])
 
 
