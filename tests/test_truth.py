@@ -226,7 +226,8 @@ def test_punctual_light_in_closed_form(device: Device):
     for s, F0 in enumerate((0.04, 1.0)):
         want = math.pi * ggx(to, some.n, some.v, 0.16, F0)[:, None] * [1, 2, 3]
         assert np.abs(lit.lit(schlick(0.16))[:, s] - want).max() < 1e-5 * want.max()
-    assert np.allclose(lit.diffuse_lit, np.maximum((to * some.n).sum(0), 0)[:, None] * [1, 2, 3], atol=1e-6)
+    want = np.maximum((to * some.n).sum(0), 0)[:, None] * [1, 2, 3]
+    assert np.allclose(lit.diffuse_lit((1.0, 1.0, 1.0)), want, atol=1e-6)
 
 
 def test_a_far_disc_is_punctual(device: Device):

@@ -24,9 +24,10 @@ from whitefurnace.lighting import irradiance
 from whitefurnace.radiance import radiance
 from whitefurnace.reading import bilinear
 from whitefurnace.recipe import Chosen, Spec, chosen
-from whitefurnace.rendering import DIELECTRIC, Lights
+from whitefurnace.rendering import Lights
 from whitefurnace.sphere import radiance_at
 from whitefurnace.suns import without_sun
+from whitefurnace.swatches import DIELECTRIC, Laid, Swatch, laid
 from whitefurnace.truth import Points, Term, Truth, albedo, term
 
 TOLERANCE = 1e-2
@@ -46,21 +47,26 @@ MOST = 0.95
 
 SUFFIXES = (".png", ".exr")
 
+MIRROR = 1 / 64
+"""Roughness below which truth is a mirror: its lobe, α = 2.4e-4, is narrower than a texel of an image of 16K."""
+
+Triple = tuple[float, float, float]
+
 
 @dataclass(frozen=True)
 class Material:
-    """What the spheres are made of but for their roughness and metalness, in the metallic-roughness model of glTF 2.0.
+    """What all spheres are made of, each a swatch of it, in the metallic-roughness model of glTF 2.0.
 
-    The specular part has the NDF, Smith's masking and F = (1 - metalness) F_d + metalness F_m, Schlick's of F0 = .04
-    and of F0 = base colour where no other `dielectric` and `metal` are given. The diffuse part is (1 - metalness) times
-    what a `diffuse` model of that base colour reflects, Lambert's where none is given, times 1 - E_d(v), E_d the
-    directional albedo of the specular part under F_d: it gets what the specular leaves, as in the engines.
+    The specular part has the NDF, Smith's masking and F = (1 - metalness) F_d + metalness F_m, Schlick's of the
+    swatch's insulator and of F0 = base colour where no other `dielectric` and `metal` are given. The diffuse part is
+    (1 - metalness) times what a `diffuse` model of that base colour reflects, Lambert's where none is given, times
+    1 - E_d(v), E_d the directional albedo of the specular part under F_d: it gets what the specular leaves, as in the
+    engines.
 
     Facets scatter once. `multiscatter` gives back what is lost by that, as most engines do: the specular part times
     1 + F0 (1/E₁ - 1), E₁ the albedo of F = 1 and F0 the Fresnel at n = v. [Turquin2019]
     """
 
-    base_color: tuple[float, float, float] = (1.0, 1.0, 1.0)
     ndf: Spec = "ggx"
     masking: Spec = "smith"
     dielectric: Spec | None = None
@@ -95,7 +101,8 @@ class Certified:
 @dataclass(frozen=True)
 class Shown:
     """`engine`, `truth` and `difference` (h, w, 3), linear; `difference` is engine - truth over the luminance of the
-    truth, 0 beside the spheres. `samples` a pixel and `estimates` of their error by column, and the certificate."""
+    truth, 0 beside the spheres. `samples` a pixel and `estimates` of their error by `roughness`, that of each column or
+    each other one of a scene, and the certificate."""
 
     engine: np.ndarray
     truth: np.ndarray
@@ -105,6 +112,7 @@ class Shown:
     certificate: tuple[Certified, ...]
     seconds: Mapping[str, float]
     covered: np.ndarray
+    roughness: tuple[float, ...]
 
     @property
     def luminance(self) -> np.ndarray:
@@ -147,12 +155,14 @@ class Spheres:
     def __init__(self, truth: Truth, material: Material, points: Points, lights: Sequence[Spec] = ()) -> None:
         self.truth, self.material, self.points = truth, material, points
         self.lights = tuple(chosen("light", spec) for spec in lights)
+        self._diffuse: dict[Triple, np.ndarray] = {}
+        self._diffuse_lit: dict[Triple, np.ndarray] = {}
 
-    def column(self, roughness: float, metalness: Sequence[float], tolerance: float,
-               ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
-        """Of one roughness: for each metalness (m, 3) by the environment and (m, 3) by the further lights, the samples
-        a point and the estimate of their error, and the terms."""
-        truth, points, color = self.truth, self.points, np.asarray(self.material.base_color, np.float64)
+    def alike(self, roughness: float, swatches: Sequence[Swatch], tolerance: float,
+              ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
+        """Of one roughness: for each swatch (m, 3) by the environment and (m, 3) by the further lights, the samples a
+        point and the estimate of their error, and the terms."""
+        truth, points = self.truth, self.points
         found = self.material.terms(roughness)
         lost = self._lost(roughness)
         made, lit, counts, estimates = {}, {}, [0], [0.0]
@@ -178,13 +188,14 @@ class Spheres:
                 once = S[:, 0] + (F0 - DIELECTRIC) / (1 - DIELECTRIC) * (S[:, 1] - S[:, 0])
             return np.asarray(once * (1 + F0 * lost[:, None]))
 
-        rest = 1 - of("dielectric", DIELECTRIC, made, albedo=True)
         pictures, extras = [], []
-        for m in metalness:
-            mixed = [(1 - m) * of("dielectric", DIELECTRIC, values) + m * of("metal", color, values)
-                     for values in (made, lit)]
-            pictures.append(mixed[0] + (1 - m) * rest * self.diffuse)
-            extras.append(mixed[1] + (1 - m) * rest * self.diffuse_lit)
+        for swatch in swatches:
+            m, base = swatch.metalness, swatch.base_color
+            color, F0 = np.asarray(base, np.float64), np.asarray(swatch.insulator, np.float64)
+            rest = 1 - of("dielectric", F0, made, albedo=True)
+            mixed = [(1 - m) * of("dielectric", F0, values) + m * of("metal", color, values) for values in (made, lit)]
+            pictures.append(mixed[0] + (1 - m) * rest * self.diffuse(base))
+            extras.append(mixed[1] + (1 - m) * rest * self.diffuse_lit(base))
         return pictures, extras, max(counts), max(estimates), found
 
     def _lost(self, roughness: float) -> np.ndarray:
@@ -195,31 +206,38 @@ class Spheres:
         return np.asarray(1 / albedo(one, self.points.NoV, self.truth.device)[:, 0] - 1)
 
     @cached_property
-    def diffuse(self) -> np.ndarray:
+    def _lambert(self) -> np.ndarray:
+        """(m, 3) E/π of the environment."""
+        cube = irradiance(self.truth.env, size=IRRADIANCE, device=self.truth.device).values
+        return bilinear(cube, self.points.n)
+
+    def diffuse(self, base_color: Triple) -> np.ndarray:
         """(m, 3): what the diffuse model reflects of the environment, base colour and all."""
         truth, points = self.truth, self.points
-        color = np.asarray(self.material.base_color, np.float64)
         if self.material.diffuse is None:
-            cube = irradiance(truth.env, size=IRRADIANCE, device=truth.device).values
-            return bilinear(cube, points.n) * color
-        found = self._diffuse_term()
-        count, _ = truth.samples(found, points, TOLERANCE / 4)
-        return np.asarray(truth.reflected(found, points, count)[0][:, np.arange(3), np.arange(3)])
+            return np.asarray(self._lambert * np.asarray(base_color, np.float64))
+        if base_color not in self._diffuse:
+            found = self._diffuse_term(base_color)
+            count, _ = truth.samples(found, points, TOLERANCE / 4)
+            self._diffuse[base_color] = truth.reflected(found, points, count)[0][:, np.arange(3), np.arange(3)]
+        return self._diffuse[base_color]
 
-    def _diffuse_term(self) -> Term:
+    def _diffuse_term(self, base_color: Triple) -> Term:
         choice = chosen("diffuse", "lambert" if self.material.diffuse is None else self.material.diffuse)
         given: dict[str, Any] = {}
         if "albedo" not in choice.given:
-            given["diffuse_albedo"] = np.asarray(self.material.base_color, np.float64)
+            given["diffuse_albedo"] = np.asarray(base_color, np.float64)
         found = term(diffuse=choice, **given)
         return Term(found.models, {name: np.broadcast_to(v, (3,)) for name, v in found.parameters.items()})
 
-    @cached_property
-    def diffuse_lit(self) -> np.ndarray:
+    def diffuse_lit(self, base_color: Triple) -> np.ndarray:
         """(m, 3) of the further lights."""
         if not self.lights:
             return np.zeros((self.points.n.shape[1], 3))
-        return np.asarray(self.lit(self._diffuse_term())[:, np.arange(3), np.arange(3)])
+        if base_color not in self._diffuse_lit:
+            values = self.lit(self._diffuse_term(base_color))
+            self._diffuse_lit[base_color] = values[:, np.arange(3), np.arange(3)]
+        return self._diffuse_lit[base_color]
 
     def lit(self, found: Term) -> np.ndarray:
         """(m, S, 3): what the further lights give under a term, in closed form or along their outlines."""
@@ -313,42 +331,46 @@ def ndf_of(manifest: str | os.PathLike[str]) -> Spec:
     return Chosen(chosen("ndf", entry["name"]).model, given)
 
 
-def panels(engine: Engine, lights: Lights, env: Environment, device: Device, material: Material, *, columns: int = 7,
-           rows: int = 3, size: int = 128, background: str = "environment", tolerance: float = TOLERANCE,
-           certify: int = 1, further: Sequence[Spec] = (),
-           progress: Callable[[str, float], None] | None = None) -> Shown:
-    """The spheres of `rendering.grid` as the engine shows them, in truth, and their difference.
+def panels(engine: Engine, lights: Lights, env: Environment, device: Device, material: Material, laid: Laid, *,
+           size: int = 128, background: str = "environment", tolerance: float = TOLERANCE, certify: int = 1,
+           further: Sequence[Spec] = (), progress: Callable[[str, float], None] | None = None) -> Shown:
+    """The spheres of `rendering.drawn` as the engine shows them, in truth, and their difference. What is smoother than
+    MIRROR is one in truth.
 
-    tolerance: of the 99th percentile of errors of the specular part of each column, over its value or 1e-3 of the mean
-    radiance. certify: pixels of each column that are held against the quadrature. further: lights besides the
-    environment, which are added to both pictures alike. Raises as `rendering.grid` does.
+    tolerance: of the 99th percentile of errors of the specular part of each roughness, over its value or 1e-3 of the
+    mean radiance. certify: pixels of each roughness that are held against the quadrature. further: lights besides the
+    environment, which are added to both pictures alike. Raises as `rendering.drawn` does.
     """
     begin = time.perf_counter()
-    shown = rendering.grid(engine, lights, columns=columns, rows=rows, size=size, base_color=material.base_color,
-                           background=background)
+    shown = rendering.drawn(engine, lights, laid, size=size, background=background)
     clock = {"engine": time.perf_counter() - begin}
     index, cover, n = rendering.sphere(size)
     points = Points(n, np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape))
     truth = Truth(device, env)
     spheres = Spheres(truth, material, points, further)
-    metalness, across = rendering.steps(rows, 1.0), rendering.steps(columns, 0.0)
+    groups: dict[float, list[int]] = {}
+    for k, one in enumerate(laid.swatches):
+        groups.setdefault(one.roughness if one.roughness >= MIRROR else 0.0, []).append(k)
     picture = np.full(shown.shape, rendering.GREY)
     if background == "environment":
         picture = radiance_at(env, rendering.camera(shown.shape)).reshape(shown.shape)
     difference, covered = np.zeros(shown.shape), np.zeros(shown.shape[:2], bool)
     mean, samples, estimates, certificate = float(np.mean(env.statistics["mean"])), [], [], []
     clock |= {"truth": 0.0, "certificate": 0.0}
-    for j, roughness in enumerate(across):
+    for j, (roughness, those) in enumerate(groups.items()):
         begin = time.perf_counter()
-        true, extra, count, estimate, terms = spheres.column(roughness, metalness, tolerance)
+        true, extra, count, estimate, terms = spheres.alike(roughness, [laid.swatches[k] for k in those],
+                                                            tolerance)
         samples.append(count)
         estimates.append(estimate)
-        for i, metal in enumerate(metalness):
-            where = np.s_[i * size:(i + 1) * size, j * size:(j + 1) * size]
-            lit = rendering.shade(engine, lights, n, points.v, np.asarray(material.base_color), metal, roughness)
-            whole = true[i] + extra[i]
-            apart = (lit - true[i]) / np.maximum(whole @ LUMINANCE, max(DARK * mean, 1e-30))[:, None]
-            shown[where] += _over(np.zeros((size, size, 3)), index, cover, extra[i])
+        for k, by_sky, by_lights in zip(those, true, extra, strict=True):
+            one, (i, across) = laid.swatches[k], divmod(k, laid.columns)
+            where = np.s_[i * size:(i + 1) * size, across * size:(across + 1) * size]
+            lit = rendering.shade(engine, lights, n, points.v, one.base_color, one.metalness, one.roughness,
+                                  np.asarray(one.insulator))
+            whole = by_sky + by_lights
+            apart = (lit - by_sky) / np.maximum(whole @ LUMINANCE, max(DARK * mean, 1e-30))[:, None]
+            shown[where] += _over(np.zeros((size, size, 3)), index, cover, by_lights)
             picture[where] = _over(picture[where], index, cover, whole)
             difference[where] = _over(difference[where], index, (cover > 0.5).astype(float), apart)
             covered[where] = _over(np.zeros((size, size, 1)), index, (cover > 0.5).astype(float),
@@ -358,8 +380,9 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
         certificate += _certificate(truth, terms, points, roughness, j * certify, certify, count, mean)
         clock["certificate"] += time.perf_counter() - begin
         if progress:
-            progress("truth", (j + 1) / columns)
-    return Shown(shown, picture, difference, tuple(samples), tuple(estimates), tuple(certificate), clock, covered)
+            progress("truth", (j + 1) / len(groups))
+    return Shown(shown, picture, difference, tuple(samples), tuple(estimates), tuple(certificate), clock, covered,
+                 tuple(groups))
 
 
 def _over(cell: np.ndarray, index: np.ndarray, cover: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -396,11 +419,12 @@ def scale_of(shown: Shown) -> float:
 
 
 def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, for_: str,
-           truth: str | os.PathLike[str], size: int = 128, columns: int = 7, rows: int = 3, exposure: float = 0.0,
-           base_color: Sequence[float] = (1.0, 1.0, 1.0), background: str = "environment",
-           tolerance: float | None = None, certify: int = 1, ndf: Spec | None = None, dielectric: Spec | None = None,
-           metal: Spec | None = None, diffuse: Spec | None = None, multiscatter: bool = False,
-           light: Sequence[Spec] = (), device: Device | str | None = None, force: bool = False,
+           truth: str | os.PathLike[str], size: int = 128, columns: int = 7, rows: int | None = None,
+           exposure: float = 0.0, base_color: Sequence[float] | None = None, background: str = "environment",
+           scene: str | os.PathLike[str] | None = None, tolerance: float | None = None, certify: int = 1,
+           ndf: Spec | None = None, dielectric: Spec | None = None, metal: Spec | None = None,
+           diffuse: Spec | None = None, multiscatter: bool = False, light: Sequence[Spec] = (),
+           device: Device | str | None = None, force: bool = False,
            progress: Callable[[str, float], None] | None = None) -> Rendered:
     """Draw the spheres of a bake for one engine, beside them the truth, and the difference: a PNG of three panels with
     a scale, or an EXR of the layers engine, truth and difference in float32, without exposure.
@@ -427,27 +451,29 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         plots.require()
     engine, folder, stem = rendering.engine_in(manifest, for_)
     lights = rendering.read_lights(engine, folder, stem)
-    material = Material(tuple(float(c) for c in base_color),  # type: ignore[arg-type]
-                        ndf_of(manifest) if ndf is None else ndf, "smith", dielectric, metal, diffuse,
-                        multiscatter)
+    for name, spec in (("dielectric", dielectric), ("metal", metal)):
+        if scene is not None and spec is not None:
+            raise UsageError(f"{name} is of the grid: the materials of a scene have their own F0")
+    spheres = laid(scene, columns, rows, base_color)
+    material = Material(ndf_of(manifest) if ndf is None else ndf, "smith", dielectric, metal, diffuse, multiscatter)
     further = [chosen("light", spec) for spec in light]
     on = device if isinstance(device, Device) else choose_device(device)
     env = source_of(manifest, truth, on)
-    shown = panels(engine, lights, env, on, material, columns=columns, rows=rows, size=size, background=background,
-                   tolerance=bound, certify=certify, further=further, progress=progress)
+    shown = panels(engine, lights, env, on, material, spheres, size=size, background=background, tolerance=bound,
+                   certify=certify, further=further, progress=progress)
     scale = scale_of(shown)
-    notices = [*lights.notices, *env.notices]
+    notices = [*lights.notices, *env.notices, *spheres.notices]
     if further:
         notices.append("what lights besides the environment add is the same in both pictures: what differs is the "
                        "environment's")
-    missed = [f"{r:.3g}" for r, e in zip(rendering.steps(columns, 0.0), shown.estimates, strict=True) if e > bound]
+    missed = [f"{r:.3g}" for r, e in zip(shown.roughness, shown.estimates, strict=True) if e > bound]
     if missed:
         notices.append(f"the tolerance of {bound:g} is missed at roughness {', '.join(missed)}: "
                        f"{max(shown.estimates):.2g} after {max(shown.samples)} samples a pixel")
-    made = Rendered(output, engine.name, shown.engine.shape[1], shown.engine.shape[0], rendering.steps(columns, 0.0),
-                    rendering.steps(rows, 1.0), exposure, lights.read, tuple(notices), env.digest, bound, shown.samples,
-                    shown.estimates, shown.certificate, shown.error, shown.within(0.5), shown.within(MOST),
-                    multiscatter, scale, shown.seconds)
+    made = Rendered(output, engine.name, shown.engine.shape[1], shown.engine.shape[0], spheres.roughness,
+                    spheres.metalness, exposure, lights.read, tuple(notices), spheres.placed(), env.digest, bound,
+                    shown.samples, shown.estimates, shown.certificate, shown.error, shown.within(0.5),
+                    shown.within(MOST), multiscatter, scale, shown.seconds)
     if output.suffix.lower() == ".exr":
         layers = ("difference", "engine", "truth")  # the order in which readers list them
         write_exr(output, np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
@@ -464,12 +490,16 @@ def _stated(made: Rendered) -> dict[str, str | float | int]:
     return {"engine": made.engine, "source": made.source, "tolerance": made.tolerance, "error": made.error,
             "certified": len(made.certificate), "samples": " ".join(map(str, made.samples)),
             "difference_median": made.median, "difference_95": made.most, "difference_scale": made.scale,
-            "scattering": "multiple" if made.multiscatter else "single"}
+            "scattering": "multiple" if made.multiscatter else "single",
+            **({"materials": "; ".join(f"{one['name']} ({one['row']}, {one['column']})" for one in made.materials)}
+               if made.materials else {})}
 
 
 def _caption(made: Rendered) -> tuple[str, ...]:
     across = f"roughness {made.roughness[0]:g} to {made.roughness[-1]:g} across" if len(made.roughness) > 1 else ""
     down = f"metalness {made.metalness[0]:g} to {made.metalness[-1]:g} down" if len(made.metalness) > 1 else "metal"
+    if made.materials:
+        across, down = f"{len(made.materials)} materials of a scene, row by row", ""
     scattering = f"truth: facets scatter {'again, by scale' if made.multiscatter else 'once'}"
     held = f", within {made.error:.1e} at {len(made.certificate)} pixels of a quadrature" if made.certificate else ""
     return (", ".join(filter(None, (across, down))),
