@@ -58,9 +58,9 @@ def test_a_sphere_is_that_of_the_grid(baked, tmp_path, engine):
     beside.render(baked / "noise.json", tmp_path / "a.exr", scene=scene(tmp_path / "a.gltf", materials), **common)
     assert np.array_equal(read_stored(tmp_path / "a.exr"), want)
     beside.render(baked / "noise.json", tmp_path / "b.exr", scene=scene(tmp_path / "b.gltf", materials[::-1]), **common)
-    for layer in np.split(read_stored(tmp_path / "b.exr"), 3, 2), :
-        for got, grid in zip(layer, np.split(want, 3, 2), strict=True):
-            assert np.array_equal(cells(got, 3)[::-1], cells(grid, 3))
+    turned = read_stored(tmp_path / "b.exr")
+    for got, grid in zip(np.split(turned, 3, 2), np.split(want, 3, 2), strict=True):
+        assert np.array_equal(cells(got, 3)[::-1], cells(grid, 3))
     rendering.render(baked / "noise.json", tmp_path / "grid.png", for_=engine, size=SIZE, columns=3, rows=2,
                      base_color=GOLD, background="plain")
     rendering.render(baked / "noise.json", tmp_path / "a.png", for_=engine, size=SIZE, columns=3,
@@ -160,13 +160,16 @@ def test_the_command_names_each_with_its_place(baked, tmp_path):
         done = CliRunner().invoke(cli, [*asked, "-o", str(tmp_path / f"b.{suffix}"), "--truth",
                                         str(baked / "noise.exr")], catch_exceptions=False)
         assert done.exit_code == 0, done.output
-        lines = [line.split()[:-4] for line in done.stdout.splitlines()[2:5]]
-        assert [line[-3:-1] if line[-1] != "1" else line[-3:] for line in lines]
-        assert all(name in done.stdout for name in names)
-    # The place that is left is background.
+        lines = done.stdout.splitlines()[2:5]
+        for line, name, place in zip(lines, names, (["1", "1"], ["1", "2"], ["2", "1"]), strict=True):
+            assert line.strip().startswith(name) and line.strip().removeprefix(name).split()[:2] == place
+    # The place that is left is background, seen by the camera: as at the corners of a grid, to half a code.
     image = read_stored(tmp_path / "a.png")
-    whole = rendering.grid(*lights_of(baked), size=16, columns=2, rows=2)
-    assert np.abs(image[16:, 16:] - rendering.srgb(whole)[16:, 16:])[0, 0].max() <= 0.5 / 255 + 1e-6
+    whole = rendering.srgb(rendering.grid(*lights_of(baked), size=16, columns=2, rows=2))
+    beside_spheres = np.ones((16, 16), bool)
+    beside_spheres.flat[rendering.sphere(16)[0]] = False
+    assert np.abs(image - whole)[16:, 16:][beside_spheres].max() <= 0.5 / 255 + 1e-6
+    assert len(np.unique(image[20:28, 20:28].reshape(-1, 3), axis=0)) > 1
 
 
 def lights_of(baked: Path):

@@ -25,6 +25,7 @@ from whitefurnace.files import (
     Lock,
     Transaction,
     acquire,
+    after_death,
     digest_file,
     finish,
     is_safe,
@@ -342,11 +343,7 @@ def read(request: Order, k: int, device: Device | str | None = None, *, dry_run:
 def tidy(path: Path) -> None:
     """Completes or removes what a run that was killed left of the output with the manifest at `path`, unless another
     run is at it. Raises FileError."""
-    if lock_path(path).exists() and (lock := acquire(lock_path(path), wait=False)):
-        try:
-            _settle(path, lock)
-        finally:
-            lock.release()
+    after_death(path, _settle)
 
 
 def _settle(path: Path, lock: Lock) -> dict[str, Any] | None:

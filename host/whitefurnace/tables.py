@@ -27,6 +27,7 @@ from whitefurnace.files import (
     Lock,
     Transaction,
     acquire,
+    after_death,
     check_table,
     digest_file,
     finish,
@@ -810,11 +811,7 @@ def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
 def tidy(path: Path) -> None:
     """Completes or removes what a run that was killed left of the table with the manifest at `path`, unless another run
     is at it. Raises FileError."""
-    if lock_path(path).exists() and (lock := acquire(lock_path(path), wait=False)):
-        try:
-            _settle(path, lock)
-        finally:
-            lock.release()
+    after_death(path, _settle)
 
 
 def _settle(path: Path, lock: Lock) -> dict[str, Any] | None:

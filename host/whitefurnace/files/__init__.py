@@ -12,7 +12,7 @@ from whitefurnace.files.harmonics import read_sh
 from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
 from whitefurnace.files.image import Image, decode_srgb, read_image, srgb_table
 from whitefurnace.files.lights import Light, is_light, light_digest, light_files, read_light, read_radiance
-from whitefurnace.files.lock import Lock, acquire, finish, is_lock, is_safe, lock_path, locks_in
+from whitefurnace.files.lock import Lock, acquire, after_death, finish, is_lock, is_safe, lock_path, locks_in
 from whitefurnace.files.manifest import read_manifest, write_manifest
 from whitefurnace.files.npy import release, scratch, write_npy
 from whitefurnace.files.npz import write_npz
@@ -34,6 +34,7 @@ __all__ = [
     "Texture",
     "Transaction",
     "acquire",
+    "after_death",
     "check_table",
     "decode_srgb",
     "digest_file",

@@ -7,7 +7,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -186,3 +186,13 @@ def locks_in(folder: Path) -> list[Path]:
             return sorted(folder / e.name for e in entries if e.name.startswith(".") and e.name.endswith(_SUFFIX))
     except OSError:
         return []
+
+
+def after_death(path: Path, settle: Callable[[Path, Lock], object]) -> None:
+    """Lets `settle` mend the output with the manifest at `path` where a run died at it, unless another is at it now.
+    Raises FileError."""
+    if lock_path(path).exists() and (lock := acquire(lock_path(path), wait=False)):
+        try:
+            settle(path, lock)
+        finally:
+            lock.release()
