@@ -39,6 +39,7 @@ from whitefurnace.rendering import Lights, looked_up
 from whitefurnace.scene import Material, Scene, Spread
 from whitefurnace.sphere import radiance_at
 from whitefurnace.split_sum import split_sum
+from whitefurnace.swatches import insulator, middle
 from whitefurnace.truth import Points, Term, Truth, term
 
 POINTS = 384
@@ -112,7 +113,7 @@ def sampled(scene: Scene, *, least: float = 0.0, count: int = POINTS, seed: int 
     metal, r, ior = np.empty(count), np.empty(count), np.empty(count)
     for k in np.unique(place):
         some, m = np.flatnonzero(place == k), scene.materials[k]
-        color[some] = _middle(m["base_color"])
+        color[some] = middle(m["base_color"])
         metal[some] = _drawn(m["metalness"], len(some), rng)
         r[some] = _drawn(m["roughness"], len(some), rng)
         f0[some], ior[some] = _insulator(m)
@@ -128,11 +129,6 @@ def sampled(scene: Scene, *, least: float = 0.0, count: int = POINTS, seed: int 
                    tuple(_left_out(scene, there, least)))
 
 
-def _middle(spread: Spread) -> np.ndarray:
-    low, high = np.array(spread.low), np.array(spread.high)
-    return np.array(spread.mean) if spread.mean else (low + high) / 2
-
-
 def _drawn(spread: Spread, count: int, rng: np.random.Generator) -> np.ndarray:
     """(count,) values of one channel in equal parts of its distribution, shuffled."""
     low, high, share = np.array(spread.shares).T
@@ -145,10 +141,9 @@ def _drawn(spread: Spread, count: int, rng: np.random.Generator) -> np.ndarray:
 
 def _insulator(m: Material) -> tuple[np.ndarray, float]:
     """(3,) F0 by KHR_materials_ior and KHR_materials_specular, and the index, 0 where they say more than an index."""
-    ior, weight, tint = _middle(m["ior"])[0], _middle(m["specular"])[0], _middle(m["specular_color"])
-    f0 = 1.0 if ior == 0 else ((ior - 1) / (ior + 1)) ** 2
-    plain = 1 < ior <= 5 and weight == 1 and np.all(tint == 1)
-    return np.minimum(f0 * tint, 1) * weight, float(ior) if plain else 0.0
+    ior = middle(m["ior"])[0]
+    plain = 1 < ior <= 5 and middle(m["specular"])[0] == 1 and np.all(middle(m["specular_color"]) == 1)
+    return np.array(insulator(m)), float(ior) if plain else 0.0
 
 
 def _fewer(values: np.ndarray, most: int) -> np.ndarray:
@@ -663,13 +658,13 @@ class Meter:
             if not len(index):
                 continue
             m = self.scene.materials[k]
-            r = max(float(_middle(m["sheen_roughness"])[0]), 0.1)
+            r = max(float(middle(m["sheen_roughness"])[0]), 0.1)
             points = self.points.some(index)
             R, E = self.truth.reflected(term(ndf="charlie", roughness=r), points, self._least_count)
             d = _mirrored(points)
             levels, own = self.truth.reflected(term(ndf="charlie", roughness=r, masking="implicit"), Points(d, d),
                                                self._least_count)
-            out[index] = _middle(m["sheen_color"]) * (E * levels[:, 0] / own - R[:, 0])
+            out[index] = middle(m["sheen_color"]) * (E * levels[:, 0] / own - R[:, 0])
         return self.entry("split sum of sheen", "other", out, "Charlie's lobe from n = v = r, Smith's masking",
                           used=False) if some and out.any() else None
 
