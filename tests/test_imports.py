@@ -50,7 +50,7 @@ ALLOWED: dict[str, set[str]] = {
     "convolution": {"recipe", "source", "plan", "device", "environments", "lobes", "sphere", "stratum", "means",
                     "octahedral", "texels"},
     "reading": {"errors", "recipe", "plan", "device", "environments", "certificate", "sphere", "convolution",
-                "fitting", "lobes"},
+                "files", "fitting", "lobes"},
     "lighting": {"errors", "catalogue", "recipe", "plan", "device", "environments", "run", "lobes", "certificate",
                  "sphere", "means", "samples", "convolution", "fitting"},
     "programs": {"catalogue", "recipe", "source", "plan", "run"},

@@ -90,10 +90,7 @@ def draw(folder: Path, models: Sequence[Model], rows: Sequence[Row], device: Dev
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot make {folder}: {error.strerror or error}") from error
+    _made(folder)
     written: list[Path] = []
     for entry in models:
         if entry.slot not in _FIGURES:
@@ -114,6 +111,13 @@ def draw(folder: Path, models: Sequence[Model], rows: Sequence[Row], device: Dev
     return written
 
 
+def _made(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot make {folder}: {error.strerror or error}") from error
+
+
 def draw_tradeoff(folder: Path, points: Sequence[Point], costs: Sequence[Cost], device: Device) -> Path:
     """`folder`/tradeoff.png: error against seconds for each environment with its Pareto front, then the costs.
 
@@ -126,10 +130,7 @@ def draw_tradeoff(folder: Path, points: Sequence[Point], costs: Sequence[Cost], 
 
     from whitefurnace.tradeoff import COST_TOLERANCE
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot make {folder}: {error.strerror or error}") from error
+    _made(folder)
     names = list(dict.fromkeys(p.environment for p in points))
     panels = [_Panel(partial(_tradeoff, [p for p in points if p.environment == name]), 5.4) for name in names]
     page = [(3.8, panels[k:k + 2]) for k in range(0, len(panels), 2)]
@@ -163,10 +164,7 @@ def draw_comparison(folder: Path, found: Comparison) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot make {folder}: {error.strerror or error}") from error
+    _made(folder)
     # The colours of one file's maps are alike: five decades down from the worst.
     shown = [row for row in found.rows if row.errors is not None]
     largest = {kind: max((row.worst for row in shown if row.kind == kind and math.isfinite(row.worst)), default=1.0)

@@ -7,7 +7,7 @@ that very direction, and says which part of the way costs what.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from whitefurnace.convolution import Convolver
 from whitefurnace.device import Device
 from whitefurnace.environments import Environment, cube_solid_angles
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
+from whitefurnace.files import pack, unpack
 from whitefurnace.fitting import Mixture, read_mixtures
 from whitefurnace.lobes import Lobe, mixture_lobe, ndf_lobe
 from whitefurnace.recipe import LEVELS_RANGE, Chain
@@ -52,48 +53,17 @@ read; `format`, what is stored of them; and `all` of it together."""
 # ------------------------------------------------------------------------------------------------- formats
 
 
-def _floats(values: np.ndarray, mantissa: int, largest: float) -> np.ndarray:
-    """Nearest unsigned float with 5 bits of exponent, bias 15, and `mantissa` bits."""
-    values = np.clip(values, 0, largest)
-    exponent = np.maximum(np.floor(np.log2(np.maximum(values, 2.0**-14))), -14)
-    step = 2.0 ** (exponent - mantissa)
-    return np.round(values / step) * step
-
-
-def _r11g11b10(values: np.ndarray) -> np.ndarray:
-    """[EXT_packed_float]: 6, 6 and 5 bits of mantissa; the largest are 65024 and 64512."""
-    return np.stack([_floats(values[..., 0], 6, 65024), _floats(values[..., 1], 6, 65024),
-                     _floats(values[..., 2], 5, 64512)], -1)
-
-
-def _rgb9e5(values: np.ndarray) -> np.ndarray:
-    """[EXT_texture_shared_exponent]: 9 bits each under the exponent of the largest channel."""
-    values = np.clip(values, 0, 65408)
-    largest = values.max(-1, keepdims=True)
-    exponent = np.maximum(np.floor(np.log2(np.maximum(largest, 2.0**-16))), -16) + 1
-    exponent += np.floor(largest / 2.0 ** (exponent - 9) + 0.5) == 512  # rounds up into the next exponent
-    step = 2.0 ** (exponent - 9)
-    return np.floor(values / step + 0.5) * step
-
-
-def _float16(values: np.ndarray) -> np.ndarray:
-    return np.clip(values, -65504, 65504).astype(np.float16).astype(np.float64)
-
-
-FORMATS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
-    "float32": lambda values: values.astype(np.float32).astype(np.float64),
-    "float16": _float16,
-    "r11g11b10": _r11g11b10,
-    "rgb9e5": _rgb9e5,
-}
-"""What stored radiance (…, 3) reads back as."""
+FORMATS: Mapping[str, str] = {"float32": "rgba32f", "float16": "rgba16f", "r11g11b10": "b10g11r11", "rgb9e5": "rgb9e5"}
+"""Formats that reads are measured through, and the pixel format of files that each is."""
 
 
 def stored(values: np.ndarray, format: str) -> np.ndarray:
-    """Radiance (…, 3) through a format of FORMATS, float64. Raises UsageError with the nearest name."""
+    """What radiance (…, 3) reads back as from a format of FORMATS, float64. Raises UsageError with the nearest name."""
     if format not in FORMATS:
         raise UsageError(f"unknown format {format!r}{nearest(format, FORMATS)}")
-    return FORMATS[format](np.asarray(values, np.float64))
+    values = np.asarray(values, np.float64)
+    form = FORMATS[format]
+    return unpack(form, pack(form, values).data, values.shape[:-1])[..., :3].astype(np.float64)
 
 
 # ------------------------------------------------------------------------------------------------- reads
