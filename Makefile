@@ -39,7 +39,7 @@ test-all: $(VENV)/device.done $(VENV)/test.done
 # What they need and cannot be had is a reason to skip them, told at the end.
 test-engines: $(VENV)/device.done $(VENV)/test.done $(VENV)/engines/node_modules
 	@export WHITEFURNACE_NODE_MODULES="$${WHITEFURNACE_NODE_MODULES:-$(CURDIR)/$(VENV)/engines/node_modules}"
-	$(BIN)/pytest -m engines $(ARGS) tests/test_engines.py
+	$(BIN)/pytest -m engines $(ARGS) tests/engines/test_engines.py
 
 bench: $(VENV)/device.done $(VENV)/test.done
 	@for file in benchmarks/*.py; do $(BIN)/python "$$file" $(ARGS); done

@@ -13,11 +13,11 @@ from importlib import resources
 
 import numpy as np
 
-from whitefurnace import source
 from whitefurnace.catalogue import Model, model, models
-from whitefurnace.derived import numbers_of
-from whitefurnace.device import Device, Kernel, choose_device
-from whitefurnace.plan import CHUNK
+from whitefurnace.opencl import source
+from whitefurnace.opencl.derived import numbers_of
+from whitefurnace.opencl.device import Device, Kernel, choose_device
+from whitefurnace.prefiltering.plan import CHUNK
 
 ROUGHNESS = 0.5
 MOST = 4

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from whitefurnace.device import Candidate, Device, choose_device, find_devices
+from shell import Shell
+from whitefurnace.opencl.device import Candidate, Device, choose_device, find_devices
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -51,3 +52,8 @@ def environments() -> list[Path]:
     if not found:
         pytest.fail(f"WHITEFURNACE_ENVIRONMENTS: no .exr or .hdr image in {folder}")
     return found
+
+
+@pytest.fixture
+def shell(capsys):
+    return Shell(capsys)

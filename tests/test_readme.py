@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from scenes import helmet
-from whitefurnace.engines import user_engine
-from whitefurnace.environments import LAYOUTS
+from whitefurnace.engines.presets import user_engine
 from whitefurnace.files import write_exr
+from whitefurnace.sphere.environments import LAYOUTS
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text("utf-8")

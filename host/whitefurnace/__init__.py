@@ -15,30 +15,30 @@ from whitefurnace.version import VERSION
 __version__ = VERSION
 
 _HOMES = {
-    "bake": "baking",
-    "dfg": "run",
-    "environment": "environments",
-    "harmonics": "lighting",
-    "integrate": "integrals",
-    "irradiance": "lighting",
-    "lut": "tables",
-    "prefilter": "lighting",
-    "sample": "sampling",
-    "without_sun": "suns",
+    "bake": "baking.bake",
+    "dfg": "integrals.quadrature",
+    "environment": "sphere.environments",
+    "harmonics": "prefiltering.lighting",
+    "integrate": "integrals.api",
+    "irradiance": "prefiltering.lighting",
+    "lut": "tables.lut",
+    "prefilter": "prefiltering.lighting",
+    "sample": "integrals.normals",
+    "without_sun": "sphere.suns",
 }
 
 __all__ = ["__version__", "bake", "dfg", "environment", "harmonics", "integrate", "irradiance", "lut", "prefilter",
            "sample", "without_sun"]
 
 if TYPE_CHECKING:
-    from whitefurnace.baking import bake
-    from whitefurnace.environments import environment
-    from whitefurnace.integrals import integrate
-    from whitefurnace.lighting import harmonics, irradiance, prefilter
-    from whitefurnace.run import dfg
-    from whitefurnace.sampling import sample
-    from whitefurnace.suns import without_sun
-    from whitefurnace.tables import lut
+    from whitefurnace.baking.bake import bake
+    from whitefurnace.integrals.api import integrate
+    from whitefurnace.integrals.normals import sample
+    from whitefurnace.integrals.quadrature import dfg
+    from whitefurnace.prefiltering.lighting import harmonics, irradiance, prefilter
+    from whitefurnace.sphere.environments import environment
+    from whitefurnace.sphere.suns import without_sun
+    from whitefurnace.tables.lut import lut
 
 
 def __getattr__(name: str) -> Any:

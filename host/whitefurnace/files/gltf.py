@@ -1,5 +1,5 @@
 """What a .glb or .gltf holds, as far as it can be trusted: its JSON, buffers, accessors and images, each checked
-against the bytes that are there before anything is allocated. Meaning is `whitefurnace.scene`'s."""
+against the bytes that are there before anything is allocated. Meaning is `whitefurnace.scenes.materials`'s."""
 
 from __future__ import annotations
 

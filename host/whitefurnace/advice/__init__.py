@@ -1,0 +1,1 @@
+"""Derives what a scene needs of a bake and what each approximation costs on it."""

@@ -1,0 +1,1 @@
+"""Bakes an environment: from a request to files and their manifest."""

@@ -1,0 +1,817 @@
+"""One environment -> the files engines load: key, skipping, ownership, writing, manifest."""
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.baking.outputs import Made, Target, targets
+from whitefurnace.baking.programs import Program, programs
+from whitefurnace.engines.presets import Engine, engines, reduced
+from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError
+from whitefurnace.files import (
+    Lock,
+    Transaction,
+    acquire,
+    after_death,
+    digest_file,
+    finish,
+    is_safe,
+    lock_path,
+    read_manifest,
+    write_manifest,
+)
+from whitefurnace.integrals.quadrature import Integrated, dfg
+from whitefurnace.opencl import source
+from whitefurnace.opencl.device import Device, choose_device
+from whitefurnace.prefiltering.convolution import Level
+from whitefurnace.prefiltering.lighting import Filtered, Lighting, Want, light
+from whitefurnace.prefiltering.plan import LevelPlan, plan_chain
+from whitefurnace.prefiltering.reading import Reader, compared
+from whitefurnace.prefiltering.recipe import (
+    DFG_SIZE,
+    IRRADIANCE_SIZE,
+    TOLERANCE_RANGE,
+    Chain,
+    Chosen,
+    chain,
+    chosen,
+    is_number,
+)
+from whitefurnace.sphere import harmonics as harmonic
+from whitefurnace.sphere.environments import Environment, check_options, environment, source_digest
+from whitefurnace.sphere.grids import Shape
+from whitefurnace.sphere.suns import Sun, sun_mode, without_sun
+from whitefurnace.tables.split_sum import SplitSum, split_sum
+from whitefurnace.version import VERSION
+
+DEMO = "demo"
+DEMO_HEIGHT = 512
+SUN_RADIUS = math.radians(0.2665)  # of the sun as seen from the earth
+SUN_RADIANCE = 4e5
+DFG_TOLERANCE = 5e-6
+SHEEN = 10
+"""How many times the tolerance Charlie's levels are allowed: a sheen reflects a tenth of what GGX does, and where its
+smooth lobes are a rim at the horizon, hard panels do not reach 1e-3 on any grid."""
+
+
+def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
+    """The built-in environment: sky, ground, and a sun over 1e5 times the mean radiance, by a kernel."""
+    program = device.build(source.demo().text, {"W": 1, "T": 1, "PRECISION": 32})
+    # At the centre of a texel, so that the disc covers one whole and the maximum is the sun's own radiance.
+    theta = (round(0.29 * height) + 0.5) * math.pi / height
+    phi = (round(1.27 * height) + 0.5) * math.pi / height - math.pi
+    size = device.local_size
+    image = device.empty((height, 2 * height, 3), np.float32)
+    count = -(-2 * height * height // size) * size
+    sun = [math.sin(theta) * math.cos(phi), math.cos(theta), math.sin(theta) * math.sin(phi)]
+    device.launch(program.kernel("demo"), (count,),
+                  (image, np.int32(height), np.int32(4), *(np.float32(x) for x in sun),
+                   np.float32(math.cos(SUN_RADIUS)), np.float32(SUN_RADIANCE)))
+    return replace(environment(image.read()), name=DEMO)
+
+
+@dataclass(frozen=True)
+class Baked:
+    """What a bake did or would do for one environment: `done`, `skipped` or `planned`, and its manifest."""
+
+    name: str
+    state: str
+    files: tuple[Path, ...]
+    manifest: dict[str, Any]
+    plan: tuple[tuple[tuple[str, ...], LevelPlan], ...]
+    """Each distinct level, with the engines it is for."""
+    nbytes: tuple[int, ...]
+    notices: tuple[str, ...]
+    levels: tuple[dict[str, Any], ...] = ()
+    seconds: float = 0.0
+    as_read: tuple[dict[str, Any], ...] = ()
+    """What an engine shows of the chain (reading.AsRead.data): of this one, or in a plan of what could be had too."""
+    programs: tuple[Program, ...] = ()
+    """Of a plan, the kernel programs that it compiles to."""
+
+
+@dataclass(frozen=True)
+class Order:
+    """A validated bake of several environments: engines, and the chain of each."""
+
+    names: tuple[str, ...]
+    sources: tuple[Any, ...]
+    output: Path
+    engines: tuple[Engine, ...]
+    chains: tuple[Chain, ...]
+    rotate: float
+    exposure: float
+    nonfinite: str
+    sun: str
+    force: bool
+    as_read: bool = False
+    window: str | float = "auto"
+
+    @property
+    def recipe(self) -> Chain:
+        """What all chains have in common: NDF, tolerance, certificates."""
+        return self.chains[0]
+
+
+def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str = "raw", rotate: float = 0.0,
+          exposure: float = 0.0, nonfinite: str = "refuse", sun: str = "keep", force: bool = False,
+          as_read: bool = False, sh: str | None = None, without: str | Sequence[str] = (), table: int | None = None,
+          **options: Any) -> Order:
+    """A validated order; `options` are those of `recipe.chain`. Raises UsageError, UnsupportedError."""
+    if not sources:
+        raise UsageError("no environment was given")
+    names = [name_of(item) for item in sources]
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            raise UsageError(f"two inputs are named {name!r}: their outputs would be the same files")
+        seen.add(name)
+    check_options(rotate, exposure, nonfinite)
+    sun_mode(sun)
+    if options.get("samples") and any(e.octahedral for e in engines(for_)):
+        raise UnsupportedError("samples are not drawn for octahedral maps; give a tolerance")
+    if options.get("certify") == 0:
+        raise UsageError("certify 0: what is written states its error; give 299 or more texels")
+    window = "auto" if sh is None else harmonic.sh_window(sh)
+    left_out = list(filter(None, map(str.strip, without.split(",")))) if isinstance(without, str) else list(without)
+    found = engines(for_)
+    if left_out or table is not None:
+        found = tuple(reduced(e, left_out, table) for e in found)
+    return Order(tuple(names), tuple(sources), Path(output), found, tuple(_chain(e, options) for e in found),
+                 float(rotate), float(exposure), nonfinite, sun, force, bool(as_read) or options.get("fit") is not None,
+                 window)
+
+
+def name_of(item: Any) -> str:
+    """The name that outputs of a source have. Raises UsageError for what is no source, or cannot name a file."""
+    if isinstance(item, Environment):
+        name = item.name
+    elif isinstance(item, (str, os.PathLike)):
+        path = Path(os.path.abspath(item))
+        name = DEMO if _is_demo(item) else path.name if path.is_dir() else path.stem
+    elif isinstance(item, np.ndarray):
+        name = "array"
+    else:
+        raise UsageError(f"bake takes paths, arrays and environments, not {type(item).__name__}")
+    if name in ("", ".", "..") or "/" in name or "\\" in name:
+        raise UsageError(f"{name!r} cannot name an output")
+    return name
+
+
+def _chain(engine: Engine, options: Mapping[str, Any]) -> Chain:
+    """The chain of an engine: its own mapping, and its sizes where none are given."""
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in ("min_size", "levels"):
+        if engine.whole and name in given:
+            raise UsageError(f"{engine.name} needs all levels down to 1²: {name.replace('_', '-')} cannot be given")
+    if "only_levels" in given and engine.container == "files":
+        raise UsageError(f"{engine.name} has all levels as mips of one texture: only-levels is of raw and exr")
+    given.setdefault("size", engine.size)
+    usual = engine.min_size
+    if engine.container == "files" and is_number(given["size"]) and given["size"] >= 1:
+        # A small probe has the levels that it can have.
+        usual = min(usual, given["size"])
+        if engine.levels and not {"min_size", "levels"} & set(given):
+            given["levels"] = min(engine.levels, int(given["size"]).bit_length())
+    try:
+        return chain(lods=engine.lods, usual_min=usual, **given)
+    except UsageError as error:
+        raise error if engine.container != "files" else UsageError(f"{engine.name}: {error}") from None
+
+
+def _is_demo(item: Any) -> bool:
+    """The word `demo` is the built-in environment, unless there is such a path: a path always wins."""
+    return str(item) == DEMO and not os.path.exists(item)
+
+
+def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str | None = None,
+         dry_run: bool = False, progress: Callable[[str, str, float], None] | None = None,
+         **options: Any) -> list[Baked]:
+    """Bakes environments (a path, an array, an `environment`, or a list of them; `demo` is built in) into `output`.
+
+    options: for_ ("raw,exr"), size, min_size, ndf, tolerance, quality or samples, rotate (degrees), exposure (stops),
+    nonfinite ("refuse", "zero"), sun ("keep", "extract", "clamp=X"), sh ("window=auto", "window=none", "window=X": of
+    engines' irradiance harmonics), without (what of engines' files no material reads, as "irradiance,sh"), table
+    (texels a side of their split-sum tables), certify (texels of each level's statement), levels, fit ("read"),
+    as_read (measures what an engine will show, as fit "read" does too and a plan always), force.
+    Files go to `output/ENGINE/STEM…`; `output/STEM.json`, written last, proves the rest whole. An environment whose
+    manifest has the same key is skipped.
+    Raises UsageError, FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an
+    environment that fails.
+    """
+    single = isinstance(sources, (str, os.PathLike, np.ndarray, Environment))
+    request = order([sources] if single else list(sources), output, **options)
+    return [bake_one(request, k, device, dry_run=dry_run, progress=progress) for k in range(len(request.names))]
+
+
+def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_run: bool = False,
+             progress: Callable[[str, str, float], None] | None = None) -> Baked:
+    """The k-th environment of an order."""
+    found = read(request, k, device, dry_run=dry_run)
+    if isinstance(found, Baked):
+        return found
+    try:
+        return write(compute(found, device, progress))
+    except BaseException:
+        abandon(found, folders=True)
+        raise
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """An environment that was read and is to be baked. It holds the lock of its output until `write` or `abandon`;
+    `there` is the manifest that is replaced, `made` the folders that were made for it."""
+
+    request: Order
+    k: int
+    env: Environment
+    sun: Sun | None
+    recipe: dict[str, Any]
+    key: str
+    there: dict[str, Any] | None
+    planned: tuple[tuple[tuple[str, ...], LevelPlan], ...]
+    lock: Lock
+    made: tuple[Path, ...]
+    on: Device | None
+    begin: float
+
+    @property
+    def path(self) -> Path:
+        """Of the manifest."""
+        return manifest_path(self.request, self.k)
+
+
+@dataclass(frozen=True)
+class Computed:
+    """What the device made of an environment, to be encoded and written. `written` are its files where what an engine
+    reads of them was measured."""
+
+    loaded: Loaded
+    on: Device
+    lit: Lighting
+    of: list[tuple[int, int]]
+    table: Integrated
+    splits: tuple[SplitSum | None, ...]
+    window: harmonic.Windowed
+    written: list[Target] | None
+    as_read: list[dict[str, Any]]
+
+
+@contextlib.contextmanager
+def _system_errors(request: Order) -> Iterator[None]:
+    """What the system says of a path in passing, as FileError."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(f"cannot use {error.filename or request.output}: {error.strerror or error}") from error
+
+
+def manifest_path(request: Order, k: int) -> Path:
+    """Where the manifest of the k-th environment is."""
+    return request.output / f"{request.names[k]}.json"
+
+
+def status(request: Order, k: int) -> Baked:
+    """Whether the k-th environment is up to date (`skipped`) or would be baked (`planned`, without a plan), from the
+    bytes of its source and outputs: nothing is decoded. Raises FileError for what cannot be read or is not ours."""
+    with _system_errors(request):
+        name, path = request.names[k], manifest_path(request, k)
+        there = _manifest_at(path, name)
+        if found := _up_to_date(request, k, there, time.perf_counter()):
+            return found
+        written = targets_of(request, name)
+        known = [m for m in (there, _manifest_at(Transaction.staging(path), name)) if m]
+        _check_ownership([*(t.path for t in written), path], known, request, path)
+        return Baked(name, "planned", tuple(t.path for t in written), {}, (), tuple(t.nbytes for t in written), ())
+
+
+def _up_to_date(request: Order, k: int, there: dict[str, Any] | None, begin: float) -> Baked | None:
+    """The item as its manifest tells it, where that proves it whole and has the key of these source bytes: a skip costs
+    reading them, not decoding them."""
+    item, told = request.sources[k], (there or {}).get("source")
+    if request.force or there is None or not isinstance(told, dict) or not isinstance(item, (str, os.PathLike)) or \
+            _is_demo(item):
+        return None
+    try:
+        digest = source_digest(item)
+    except WhitefurnaceError:  # reading it says what is wrong
+        return None
+    turn = math.radians(math.remainder(request.rotate, 360.0))
+    recipe = _canonical(request, turn, request.exposure or 0.0)
+    if there.get("key") != _key(digest, recipe) or not _whole(there, request.output):
+        return None
+    written = targets_of(request, request.names[k])
+    return Baked(request.names[k], "skipped", tuple(t.path for t in written), there, (),
+                 tuple(t.nbytes for t in written), tuple(told.get("notices", ())), tuple(there.get("levels", ())),
+                 time.perf_counter() - begin)
+
+
+def read(request: Order, k: int, device: Device | str | None = None, *, dry_run: bool = False) -> Baked | Loaded:
+    """Reads the k-th environment of an order and takes the lock of its output, waiting where another run has it. A
+    Baked where there is nothing to do, or where `dry_run` asks what would be done. No device but for `demo` and a plan.
+    Raises FileError, InputError."""
+    with _system_errors(request):
+        begin = time.perf_counter()
+        path = manifest_path(request, k)
+        there = _manifest_at(path, request.names[k])
+        if found := _up_to_date(request, k, there, begin):
+            if not dry_run:
+                tidy(path)  # killed when the manifest was there
+            return found
+        if dry_run:
+            planned = _read(request, k, device, None, (), there, begin)
+            assert isinstance(planned, Baked)
+            return planned
+        folders = sorted({request.output, *(t.path.parent for t in targets_of(request, request.names[k]))})
+        made = tuple(folder for folder in folders if not folder.exists())
+        lock = None
+        try:
+            lock = acquire(lock_path(path), folder=True)
+            assert lock is not None
+            there = _settle(path, lock)
+            found = _up_to_date(request, k, there, begin)  # of the run that had the lock, or of one that died
+            loaded = found or _read(request, k, device, lock, made, there, begin)
+        except BaseException:
+            _give_up(lock, made)
+            raise
+        if isinstance(loaded, Baked):
+            lock.release()
+        return loaded
+
+
+def tidy(path: Path) -> None:
+    """Completes or removes what a run that was killed left of the output with the manifest at `path`, unless another
+    run is at it. Raises FileError."""
+    after_death(path, _settle)
+
+
+def _settle(path: Path, lock: Lock) -> dict[str, Any] | None:
+    """Completes what a run that was killed between its renames left staged, removes what it left otherwise, and gives
+    the manifest that is there then."""
+    name, staging = path.name.removesuffix(".json"), Transaction.staging(path)
+    there, staged = _manifest_at(path, name), _manifest_at(staging, name)
+    if staged and (there or not os.path.lexists(path)):
+        ours: dict[str, set[Any]] = {}
+        for known in (there, staged):
+            for relative, entry in _entries(known).items() if known else ():
+                ours.setdefault(relative, set()).add(entry.get("sha256"))
+        files = {relative: entry.get("sha256") for relative, entry in staged["files"].items()}
+        renames = finish(path, files, ours)
+        if renames is not None:
+            *first, last = renames
+            stale, _ = _superseded(_engines_of(staged), path.parent, there, files)
+            for source_, target in first:
+                os.replace(source_, target)
+            for file in stale:
+                with contextlib.suppress(OSError):
+                    file.unlink()
+            os.replace(*last)
+            there, staged = staged, None
+    # What could not be completed still proves whose the renamed files are.
+    lock.sweep(keep=[staging] if staged else ())
+    return there
+
+
+def _engines_of(manifest: Mapping[str, Any]) -> list[str]:
+    recipe = manifest.get("recipe")
+    names = recipe.get("for") if isinstance(recipe, dict) else None
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
+
+
+def _read(request: Order, k: int, device: Device | str | None, lock: Lock | None, made: tuple[Path, ...],
+          there: dict[str, Any] | None, begin: float) -> Baked | Loaded:
+    name, item, path = request.names[k], request.sources[k], manifest_path(request, k)
+    on: Device | None = device if isinstance(device, Device) else None
+    if _is_demo(item):
+        on = on or choose_device(device if isinstance(device, str) else None)
+        item = demo(on)
+    # With its rotation and exposure applied: the kernels see the environment only through these.
+    env = environment(item, rotate=request.rotate, exposure=request.exposure,
+                      nonfinite=request.nonfinite)  # type: ignore[arg-type]
+    env, sun = without_sun(env, request.sun)
+    recipe = _canonical(request, env.rotation, env.exposure)
+    key = _key(env.digest, recipe)
+    written = targets_of(request, name)
+    planned = planned_levels(request, math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2))
+    files = tuple(t.path for t in written)
+    sizes = tuple(t.nbytes for t in written)
+    if not request.force and there and there.get("key") == key and _whole(there, request.output):
+        return Baked(name, "skipped", files, there, planned, sizes, env.notices,
+                     tuple(there.get("levels", ())), time.perf_counter() - begin)
+    # Ours is also what the manifest proves that a killed run left staged.
+    known = [m for m in (there, _manifest_at(Transaction.staging(path), name)) if m]
+    _check_ownership([*files, path], known, request, path)
+    if lock is None:
+        shown, notices = _would_read(request, env, device, on)
+        return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, (*env.notices, *notices),
+                     as_read=shown, programs=_programs(request, env))
+    lock.note([*files, path, path.with_name(f"{name}.probe")])
+    for folder in sorted({request.output, *(file.parent for file in files)}):
+        _check_writable(folder, name)
+    return Loaded(request, k, env, sun, recipe, key, there, planned, lock, made, on, begin)
+
+
+def _give_up(lock: Lock | None, made: Sequence[Path]) -> None:
+    if lock:
+        lock.release()
+    for folder in reversed(made):
+        with contextlib.suppress(OSError):  # not empty: something of ours is whole
+            folder.rmdir()
+
+
+def abandon(found: Loaded | Computed, *, folders: bool = False) -> None:
+    """Lets go of an item that will not be written, and with `folders` of those made for it that are empty."""
+    loaded = found.loaded if isinstance(found, Computed) else found
+    _give_up(loaded.lock, loaded.made if folders else ())
+
+
+def compute(loaded: Loaded, device: Device | str | None = None,
+            progress: Callable[[str, str, float], None] | None = None) -> Computed:
+    """All that the device does for an environment. Raises CheckError, DeviceError, UnsupportedError."""
+    request, name = loaded.request, loaded.request.names[loaded.k]
+    with _system_errors(request):
+        on = loaded.on or (device if isinstance(device, Device) else choose_device(device))
+        tell = (lambda what, share: progress(name, what, share)) if progress else None
+        wants, of = _wanted(request)
+        lit = light(on, loaded.env, wants, seed=loaded.key, progress=tell)
+        ndf = _Held.of(request.recipe.ndf)
+        table = _table(on, ndf)
+        splits = tuple(_split(on, ndf, engine) if engine.holding("dfg") else None for engine in request.engines)
+        window = harmonic.windowed(lit.sh, request.window)
+        made = Computed(loaded, on, lit, of, table, splits, window, None, [])
+        if not request.as_read:
+            return made
+        written = _encoded(made)
+        return replace(made, written=written, as_read=_as_read(request, on, loaded.env, lit, of, written))
+
+
+def _encoded(made: Computed) -> list[Target]:
+    """The files of every engine with what writes them."""
+    loaded, request = made.loaded, made.loaded.request
+    provenance = {"version": VERSION, "key": loaded.key, "source": loaded.env.digest,
+                  "recipe": json.dumps(loaded.recipe, sort_keys=True)}
+    written = []
+    for e, engine in enumerate(request.engines):
+        own, sheen = made.of[e]
+        parts = Made(made.lit, made.lit.chains[own], made.lit.chains[sheen] if engine.holding("sheen") else None,
+                     made.table, made.splits[e], made.window, provenance)
+        written += targets(engine, request.chains[e], request.output, request.names[loaded.k], parts)
+    return written
+
+
+def write(made: Computed) -> Baked:
+    """Encodes and writes what was computed, the manifest last, and lets go of the lock. Needs no device. Raises
+    FileError; then nothing was written."""
+    try:
+        with _system_errors(made.loaded.request):
+            return _write(made)
+    finally:
+        made.loaded.lock.release()
+
+
+def _write(made: Computed) -> Baked:
+    loaded, request, lit = made.loaded, made.loaded.request, made.lit
+    name = request.names[loaded.k]
+    written = _encoded(made) if made.written is None else made.written
+    manifest = _manifest(request, name, loaded.env, loaded.sun, loaded.recipe, loaded.key, made.on, lit, made.of,
+                         made.table, made.window)
+    if request.as_read:
+        manifest["as_read"] = made.as_read
+    for folder in {target.path.parent for target in written}:  # another item's failure may have removed it
+        folder.mkdir(parents=True, exist_ok=True)
+    with Transaction() as transaction:
+        digests = {}
+        for target in written:
+            assert target.write is not None
+            target.write(transaction)
+            digests[target.path.relative_to(request.output).as_posix()] = {
+                **target.told, "sha256": digest_file(transaction.staged(target.path)),
+                "bytes": transaction.staged(target.path).stat().st_size}
+        manifest["files"] = digests
+        stale, manifest["kept"] = _superseded([e.name for e in request.engines], request.output, loaded.there, digests)
+        write_manifest(loaded.path, manifest, into=transaction)
+        transaction.commit(stale)
+    seconds = [level.seconds for level, *_ in _rows_of(request, lit, made.of, "levels")]
+    rows = tuple({**row, "seconds": s} for row, s in zip(manifest["levels"], seconds, strict=True))
+    return Baked(name, "done", tuple(t.path for t in written), manifest, loaded.planned,
+                 tuple(t.nbytes for t in written),
+                 (*loaded.env.notices, *made.table.notices, *format_notices(manifest)), rows,
+                 time.perf_counter() - loaded.begin, tuple(manifest.get("as_read", ())))
+
+
+def targets_of(request: Order, name: str) -> list[Target]:
+    """The files of every engine, for an environment of that name."""
+    return [target for engine, recipe in zip(request.engines, request.chains, strict=True)
+            for target in targets(engine, recipe, request.output, name)]
+
+
+def _wanted(request: Order) -> tuple[list[Want], list[tuple[int, int]]]:
+    """The chains to make, equal ones once, and for each engine the places of its own and of Charlie's in them."""
+    def most(a: int | None, b: int | None) -> int | None:
+        return None if a is None or b is None else max(a, b)  # None: all
+
+    wants: list[Want] = []
+    of = []
+    for engine, recipe in zip(request.engines, request.chains, strict=True):
+        places = []
+        own = Want(recipe, None if engine.cubes("specular") else 0,
+                   None if engine.latlong else min(len(engine.holding("environment")), 1),
+                   None if engine.octahedral else 0)
+        sheen = Want(replace(recipe, ndf=chosen("ndf", "charlie"), fit=None,
+                             tolerance=min(SHEEN * recipe.tolerance, TOLERANCE_RANGE[1])),
+                     None if engine.holding("sheen") else 0)
+        for want in (own, sheen):
+            place = next((k for k, other in enumerate(wants) if other.recipe == want.recipe), len(wants))
+            if place == len(wants):
+                wants.append(want)
+            else:
+                old = wants[place]
+                wants[place] = Want(want.recipe, most(old.cubes, want.cubes), most(old.latlongs, want.latlongs),
+                                    most(old.octahedral, want.octahedral))
+            places.append(place)
+        of.append((places[0], places[1]))
+    return wants, of
+
+
+def _rows_of(request: Order, lit: Lighting, of: Sequence[tuple[int, int]],
+             what: str) -> list[tuple[Level, float | None, str, tuple[str, ...]]]:
+    """Each distinct level of `what` (a field of Filtered), what of the energy it keeps (of levels alone), its NDF and
+    the engines it is for."""
+    found: dict[int, tuple[Level, float | None, str, tuple[str, ...]]] = {}
+    for e, engine in enumerate(request.engines):
+        for place, ndf in zip(of[e], (request.recipe.ndf.model.name, "charlie"), strict=True):
+            if place == of[e][1] and not engine.holding("sheen") and place != of[e][0]:
+                continue
+            chain_: Filtered = lit.chains[place]
+            if what in ("levels", "coverage") and not engine.cubes("specular"):
+                continue
+            if what.startswith("octahedral") and not engine.octahedral:
+                continue
+            if what in ("latlongs", "latlong_coverage") and not (engine.latlong or engine.holding("environment")):
+                continue
+            levels = getattr(chain_, what)
+            kept = chain_.energy_kept if what == "levels" else [None] * len(levels)
+            for level, k in zip(levels, kept, strict=True):
+                old = found.get(id(level), (level, k, ndf, ()))  # level 0 is of every NDF
+                names = old[3] if engine.name in old[3] else (*old[3], engine.name)
+                found[id(level)] = (level, k, old[2], names)
+    # From large to small and smooth to rough: each engine's are then in the order of its levels.
+    return sorted(found.values(), key=lambda row: (row[2] == "charlie", -row[0].texels.shape[-2], row[0].roughness))
+
+
+def _programs(request: Order, env: Environment) -> tuple[Program, ...]:
+    """The kernel programs of a bake."""
+    wants, _ = _wanted(request)
+    texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
+    # What no engine has at all is made of no program.
+    chains = [want.recipe for want in wants if (want.cubes, want.latlongs, want.octahedral) != (0, 0, 0)]
+    charlie = any(engine.dfg.charlie and engine.holding("dfg") for engine in request.engines)
+    return programs(chains or [wants[0].recipe], env.kind, texel, demo=env.name == DEMO, charlie=charlie)
+
+
+def planned_levels(request: Order, texel: float) -> tuple[tuple[tuple[str, ...], LevelPlan], ...]:
+    """Each distinct level of the engines' chains, with their names."""
+    rows: list[tuple[list[str], LevelPlan]] = []
+    for engine, recipe in zip(request.engines, request.chains, strict=True):
+        if not engine.needs("specular"):
+            continue
+        for level in plan_chain(recipe, texel):
+            names = next((names for names, other in rows if other == level), None)
+            if names is None:
+                rows.append(([engine.name], level))
+            else:
+                names.append(engine.name)
+    rows.sort(key=lambda row: (-row[1].size, row[1].roughness))
+    return tuple((tuple(sorted(names)), level) for names, level in rows)
+
+
+def _as_read(request: Order, on: Device, env: Environment, lit: Lighting, of: Sequence[tuple[int, int]],
+             written: Sequence[Target]) -> list[dict[str, Any]]:
+    """What each engine shows of its chain, in its mapping and from its format."""
+    rows: list[dict[str, Any]] = []
+    read = [e for e, engine in enumerate(request.engines) if engine.cubes("specular")]
+    if not read:
+        return rows
+    reader = Reader(on, env, *(request.chains[e] for e in read))
+    for e in read:
+        engine, levels = request.engines[e], lit.chains[of[e][0]].levels
+        target = next((t for t in written if t.engine == engine.name and len(t.levels) == len(levels)), None)
+        found = reader.as_read(request.chains[e], [level.texels for level in levels], [level.error for level in levels],
+                               kept=target.levels if target else None,
+                               format=str(target.told.get("format", "float32")) if target else "float32")
+        rows.append({"for": engine.name, **found.data()})
+    return rows
+
+
+FORMAT_LOSS = 0.05
+"""A format that costs a level's p99 more than this is worth a notice."""
+
+
+def format_notices(manifest: Mapping[str, Any]) -> list[str]:
+    """What formats cost that users would want to know."""
+    found = []
+    for name, entry in manifest["files"].items():
+        if entry.get("clipped"):
+            found.append(f"{name}: {entry['clipped']} values over the range of {entry['format']} became its largest; "
+                         "--sun extract or a lower --exposure keeps them")
+        if "sh" in str(entry.get("holds", "")).split(", ") and manifest["sh"]["window"] != [1.0, 1.0, 1.0]:
+            sh = manifest["sh"]
+            found.append(f"{name}: degrees 1 and 2 of its harmonics are windowed by {sh['window'][1]:.3f} and "
+                         f"{sh['window'][2]:.3f}; their least E/π is {min(sh['minimum']['after']):.3g}, without it "
+                         f"{min(sh['minimum']['before']):.3g}, their RMSE {sh['rmse']:.2g}")
+        worst = max((level.get("format_p99", 0.0) for level in entry.get("levels", ())), default=0.0)
+        if worst > FORMAT_LOSS:
+            found.append(f"{name}: {entry['format']} costs {worst:.2g} of a texel's value (p99)")
+    return found
+
+
+def _would_read(request: Order, env: Environment, device: Device | str | None,
+                on: Device | None) -> tuple[tuple[dict[str, Any], ...], tuple[str, ...]]:
+    """What engines would show of the planned chain and of others, and notices: a plan needs no device for the rest."""
+    try:
+        on = on or choose_device(device if isinstance(device, str) else None)
+    except DeviceError as error:
+        if device is not None:
+            raise
+        return (), (f"errors as read are not measured: {error}",)
+    rows: list[dict[str, Any]] = []
+    done: list[Chain] = []
+    for engine, recipe in zip(request.engines, request.chains, strict=True):
+        if engine.needs("specular") and recipe not in done:
+            done.append(recipe)
+            rows += [{"for": engine.name, **read.data()}
+                     for read in compared(on, env, recipe, alone=engine.whole or engine.levels is not None)]
+    return tuple(rows), ()
+
+
+def _superseded(engines: Sequence[str], output: Path, there: dict[str, Any] | None,
+                digests: Mapping[str, Any]) -> tuple[list[Path], dict[str, Any]]:
+    """What the old manifest proves ours and a bake for `engines` does not write: files of the same engines, which are
+    stale (a longer chain's last levels), and entries of other engines, which stay and stay ours."""
+    stale, kept = [], {}
+    for relative, entry in _entries(there).items() if there else ():
+        file = output / relative
+        if relative in digests or not file.is_file() or digest_file(file) != entry.get("sha256"):
+            continue
+        if relative.split("/")[0] in engines:
+            stale.append(file)
+        else:
+            kept[relative] = entry
+    return stale, kept
+
+
+def _entries(manifest: dict[str, Any]) -> dict[str, Any]:
+    """Every file that a manifest proves ours, those of earlier bakes for other engines too."""
+    return {**manifest.get("kept", {}), **manifest["files"]}
+
+
+def _canonical(request: Order, rotation: float, exposure: float) -> dict[str, Any]:
+    """The recipe as data: everything that changes the bytes, and nothing else."""
+    own = {e.name: {"engine": e.data(), "chain": c.canonical()}
+           for e, c in zip(request.engines, request.chains, strict=True) if e.container == "files" or e.without}
+    return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines),
+            **({"engines": own} if own else {}), **({"sh": request.window} if own or request.window != "auto" else {}),
+            "rotate": round(math.degrees(rotation), 9),
+            "exposure": exposure, "nonfinite": request.nonfinite, "sun": request.sun, "irradiance": IRRADIANCE_SIZE,
+            **({"as_read": True} if request.as_read else {}),
+            "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE}}
+
+
+@dataclass(frozen=True)
+class _Held:
+    """An NDF as the key of what is kept between the images of a bake: this very entry, not one of the same name."""
+
+    identity: int
+    given: tuple[tuple[str, Any], ...]
+    choice: Chosen = field(compare=False)
+    """Kept too, so that no other entry takes its identity."""
+
+    @staticmethod
+    def of(choice: Chosen) -> _Held:
+        return _Held(id(choice.model), tuple(sorted(choice.given.items())), choice)
+
+
+@lru_cache(maxsize=4)
+def _table(device: Device, ndf: _Held) -> Integrated:
+    """The DFG table: of the NDF and the device alone, so the same for every image. Not to be written to."""
+    table = dfg(DFG_SIZE, ndf=ndf.choice, tolerance=DFG_TOLERANCE, device=device)
+    table.values.flags.writeable = False
+    return table
+
+
+@lru_cache(maxsize=16)
+def _split(device: Device, ndf: _Held, engine: Engine) -> SplitSum:
+    """The table of a preset, the same for every image."""
+    return split_sum(engine.dfg, device=device, ndf=ndf.choice)
+
+
+def _key(digest: str, recipe: dict[str, Any]) -> str:
+    """sha256 over the source bytes, the canonical recipe (with the text of a user's NDF), all kernels, since tables and
+    derived numbers take many of them, and the version."""
+    parts = [VERSION, digest, json.dumps(recipe, sort_keys=True), source.everything()]
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
+    """The manifest of this item at `path`, or None where there is none that could prove anything."""
+    found = read_manifest(path)
+    if found is None or found.get("name") != name:
+        return None
+    for files in (found.get("files"), found.get("kept", {})):
+        if not (isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values())
+                and all(is_safe(relative) for relative in files)):
+            return None
+    return found
+
+
+def _whole(manifest: dict[str, Any], output: Path) -> bool:
+    for relative, entry in manifest["files"].items():
+        path = output / relative
+        if not path.is_file() or digest_file(path) != entry.get("sha256"):
+            return False
+    return True
+
+
+def _check_ownership(paths: Sequence[Path], known: Sequence[dict[str, Any]], request: Order, manifest: Path) -> None:
+    """Refuses to replace what no manifest of ours proves to be ours for this item. Raises FileError."""
+    if request.force:
+        return
+    ours: dict[str, set[Any]] = {}
+    for m in known:
+        for relative, entry in _entries(m).items():
+            ours.setdefault(relative, set()).add(entry.get("sha256"))
+    for path in paths:
+        if not path.exists():
+            continue
+        if path == manifest and known:
+            continue
+        relative = path.relative_to(request.output).as_posix()
+        if relative not in ours or not path.is_file() or digest_file(path) not in ours[relative]:
+            raise FileError(f"{path} is there and was not written by this bake; move it away or give --force")
+
+
+def _check_writable(output: Path, name: str) -> None:
+    """Finds an output folder that cannot be made or written before the work is done, not after."""
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        probe = Transaction.staging(output / f"{name}.probe")  # no two items of a folder have a name in common
+        probe.unlink(missing_ok=True)  # of a run that was killed, or a link: never written through
+        try:
+            with open(probe, "xb"):
+                pass
+        finally:  # Ctrl-C between the two would leave it there
+            probe.unlink(missing_ok=True)
+    except OSError as error:
+        raise FileError(f"cannot write into {output}: {error.strerror or error}") from error
+
+
+def _manifest(request: Order, name: str, env: Environment, sun: Sun | None, recipe: dict[str, Any], key: str,
+              device: Device, lit: Lighting, of: Sequence[tuple[int, int]], table: Integrated,
+              window: harmonic.Windowed) -> dict[str, Any]:
+    def row(level: Level, kept: float | None = None, ndf: str | None = None,
+            names: Sequence[str] = ()) -> dict[str, Any]:
+        data = {"size": level.texels.shape[-2], "roughness": level.roughness, "method": level.method,
+                "pairs": level.pairs, "error": level.error, "worst": level.worst, "rmse": level.rmse}
+        data |= {"for": sorted(names)} if names else {}
+        data |= {"ndf": ndf} if ndf not in (None, request.recipe.ndf.model.name) else {}
+        return data if kept is None else {**data, "energy_kept": 1 + kept}
+
+    def rows(what: str) -> list[dict[str, Any]]:
+        return [row(*found) for found in _rows_of(request, lit, of, what)]
+
+    cube = Shape(False, IRRADIANCE_SIZE)
+    off, most = harmonic.rmse_against(window.values, lit.irradiance.texels, cube.directions(), cube.solid_angles())
+    return {
+        "whitefurnace": VERSION,
+        "name": name,
+        "key": key,
+        "recipe": recipe,
+        "device": device.identity(),
+        "source": {"sha256": env.digest, "layout": env.layout, "statistics": env.statistics,
+                   "notices": list(env.notices)},
+        **({} if sun is None else {"sun": sun.data()}),
+        **({"engines": {e.name: {"facts": e.facts, "proven": e.proven, "steps": list(e.steps)}
+                        for e in request.engines if e.container == "files"}}
+           if any(e.container == "files" for e in request.engines) else {}),
+        "levels": rows("levels"),
+        "latlong_levels": rows("latlongs"),
+        **({"octahedral_levels": rows("octahedral")} if any(e.octahedral for e in request.engines) else {}),
+        "coverage_levels": [*rows("coverage"), *rows("latlong_coverage"), *rows("octahedral_coverage")],
+        "irradiance": row(lit.irradiance),
+        "sh": {"coefficients": lit.sh.tolist(), "error": lit.sh_error, "mode": window.mode,
+               "window": window.window.tolist(), "minimum": {"before": window.before.tolist(),
+                                                             "after": window.after.tolist()},
+               "rmse": off, "worst": most},
+        "dfg": {"size": DFG_SIZE, "error": table.error, "rule": table.rule},
+    }

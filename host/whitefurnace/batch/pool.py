@@ -1,0 +1,794 @@
+"""Three stages over many items: in this process, in worker processes of this machine, or on a Dask cluster.
+
+It knows nothing of what the stages do. Within a process they overlap: while one item is computed the next are read and
+the last is written. An item that fails, or kills its process, takes no other with it.
+"""
+from __future__ import annotations
+
+import contextlib
+import itertools
+import logging
+import multiprocessing
+import os
+import pickle
+import queue
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
+from types import FrameType
+from typing import Any
+
+from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError
+from whitefurnace.opencl.device import core_limit, cores
+from whitefurnace.version import VERSION
+
+MOST_WORKERS = 1024
+RESOURCE = "OPENCL"
+# Of a worker's OPENCL=1: four items at a time, one in each stage and one waiting, fill its pipeline. A binary
+# fraction, so that four are exactly one.
+SHARE = 0.25
+# Items a Dask worker has or is about to get: with two more than it works on it never waits for the network, and
+# after Ctrl-C little is left to finish.
+WINDOW = 6
+# The first worker builds the kernels alone; where it builds none (all items were there already) or hangs, the others
+# join it after this many results or seconds.
+FIRST = 8
+FIRST_SECONDS = 30.0
+CONNECT_SECONDS = 10  # for a scheduler to answer
+TICK = 0.1  # seconds between two looks at what sends no message: Ctrl-C, a lost scheduler
+PATIENCE = 3.0  # seconds that a stage may take to end after the second Ctrl-C, before its process is killed
+
+
+@dataclass(frozen=True)
+class Stages:
+    """What is done to an item: functions of modules, so that they can be sent to other processes by their names.
+
+    `prepare(item)` reads, `compute(prepared)` is the only one on the device and runs in one thread, `write(computed)`
+    stores; any of the three may return a `result` instead, which ends that item. `abandon(prepared or computed)` undoes
+    what will not go on; `failed(item, message, exit_code)` makes the result of what the pool itself finds. `load(item)`
+    gives the item as it is sent to a cluster. Items and results are small and can be pickled.
+    """
+
+    prepare: Callable[[Any], Any]
+    compute: Callable[[Any], Any]
+    write: Callable[[Any], Any]
+    abandon: Callable[[Any], None]
+    failed: Callable[..., Any]
+    result: type
+    load: Callable[[Any], Any] | None = None
+
+
+def run(stages: Stages, items: Iterable[Any], *, workers: int = 1, scheduler: str | None = None,
+        on_result: Callable[[Any], None], on_notice: Callable[[str], None] | None = None,
+        stop: threading.Event | None = None) -> None:
+    """Takes every item through the stages; `on_result` gets each result, in order of completion, in this thread.
+
+    With one worker in this process; with more in as many processes, each with its share of the cores; with
+    `scheduler` on the workers of a Dask cluster that declare the resource OPENCL. `items` is taken from as there is
+    room, so it may be endless. Ctrl-C, or `stop`, finishes what is in flight; a second Ctrl-C abandons that too.
+    Raises KeyboardInterrupt after either; UsageError for impossible arguments; UnsupportedError without Dask or with
+    another version of this package on a worker; FileError where no scheduler answers or it is lost; DeviceError where
+    worker processes cannot start; what `items` raises, after what was in flight.
+    """
+    if not 1 <= workers <= MOST_WORKERS:
+        raise UsageError(f"{workers} workers: give 1 to {MOST_WORKERS}")
+    if scheduler is not None and workers != 1:
+        raise UsageError("workers and a scheduler: a cluster has its own workers; give one of the two")
+    tell = on_notice or (lambda text: None)
+    with _Interrupts(stop or threading.Event(), tell) as interrupts:
+        if scheduler is not None:
+            _on_cluster(stages, items, scheduler, on_result, tell, interrupts)
+        elif workers > 1:
+            _Crew(stages, items, workers, on_result, tell, interrupts).run()
+        else:
+            _here(stages, items, on_result, interrupts)
+        if interrupts.count:
+            raise KeyboardInterrupt
+
+
+class _Interrupts:
+    """Ctrl-C while it lasts: the first sets `stop`, the second raises KeyboardInterrupt in the main thread."""
+
+    def __init__(self, stop: threading.Event, tell: Callable[[str], None]) -> None:
+        self.stop = stop
+        self.count = 0
+        self._tell = tell
+        self._told = False
+        self._before: Any = None
+        self.main = threading.current_thread() is threading.main_thread()
+
+    def __enter__(self) -> _Interrupts:
+        if self.main:
+            self._before = signal.signal(signal.SIGINT, self._heard)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.main:
+            signal.signal(signal.SIGINT, signal.SIG_DFL if self._before is None else self._before)
+
+    def _heard(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+        self.stop.set()
+        if self.count > 1:
+            raise KeyboardInterrupt
+
+    def look(self) -> bool:
+        """Whether to begin nothing new; says so once, outside of the signal's handler."""
+        if self.count and not self._told:
+            self._told = True
+            self._tell("finishing what is in flight; Ctrl-C again stops it")
+        return self.stop.is_set()
+
+    @staticmethod
+    @contextlib.contextmanager
+    def held() -> Iterator[None]:
+        """Keeps Ctrl-C, which reaches all processes of a terminal, from one that starts meanwhile until it can ignore
+        it: a blocked signal is inherited, and is not lost to us."""
+        if not hasattr(signal, "pthread_sigmask"):
+            yield
+            return
+        resource_tracker.ensure_running()  # when multiprocessing starts it, it lets the signal through again
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _message(error: BaseException) -> str:
+    """One line that tells an exception; its class too, unless it is ours and reads as a sentence."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, WhitefurnaceError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
+
+
+def _code(error: BaseException) -> int:
+    return error.exit_code if isinstance(error, WhitefurnaceError) else FileError.exit_code
+
+
+# ---------------------------------------------------------------------------------------------- in a process
+
+
+class Pipeline:
+    """Reads, computes and writes consecutive items at the same time, in three threads.
+
+    At most two items are read ahead (one of them still being read) and two wait behind (one being written).
+    `source()` gives the next `(ticket, item)` or None at the end and `emit(ticket, item, result)` takes what became of
+    it, in any of the three threads.
+    """
+
+    def __init__(self, stages: Stages, source: Callable[[], tuple[int, Any] | None],
+                 emit: Callable[[int, Any, Any], None]) -> None:
+        self._stages = stages
+        self._source = source
+        self._emit = emit
+        self._ahead: queue.Queue[tuple[int, Any] | None] = queue.Queue(1)
+        self._behind: queue.Queue[tuple[int, Any] | None] = queue.Queue(1)
+        self._held: dict[int, Any] = {}  # by ticket, what a stage gave and the next has not taken
+        self._lock = threading.Lock()
+        self._closed = threading.Event()
+        self._failure: BaseException | None = None
+
+    def run(self, idle: Callable[[], None] = lambda: None) -> None:
+        """Computes in the calling thread until the source ends; calls `idle` between items and every 0.1 s.
+
+        Raises what the source or `emit` raised, after all items; if this thread is interrupted it abandons them all.
+        """
+        reader = threading.Thread(target=self._read, name="read", daemon=True)
+        writer = threading.Thread(target=self._write, name="write", daemon=True)
+        reader.start()
+        writer.start()
+        try:
+            while True:
+                try:
+                    job = self._ahead.get(timeout=TICK)
+                except queue.Empty:
+                    idle()
+                    continue
+                if job is None:
+                    break
+                ticket, item = job
+                done = self._stage(self._stages.compute, self._held[ticket], ticket, item)
+                while not done:
+                    try:
+                        self._behind.put(job, timeout=TICK)
+                        break
+                    except queue.Full:
+                        idle()
+                idle()
+            while writer.is_alive():
+                with contextlib.suppress(queue.Full):
+                    self._behind.put(None, timeout=TICK)
+                    break
+                idle()
+            while writer.is_alive():
+                writer.join(TICK)
+                idle()
+            idle()
+        except BaseException:
+            self._close(writer)
+            raise
+        if self._failure is not None:
+            raise self._failure
+
+    def _stage(self, stage: Callable[[Any], Any], value: Any, ticket: int, item: Any) -> bool:
+        """Runs a stage of an item and holds what it gave; whether that ends the item."""
+        try:
+            given = stage(value)
+        except Exception as error:  # the item's own: the others go on
+            if stage is not self._stages.prepare:
+                self._undo(value)
+            given = self._stages.failed(item, _message(error), _code(error))
+        with self._lock:
+            if not isinstance(given, self._stages.result) and not self._closed.is_set():
+                self._held[ticket] = given
+                return False
+            self._held.pop(ticket, None)
+        if isinstance(given, self._stages.result):
+            self._emit(ticket, item, given)
+        else:
+            self._undo(given)
+        return True
+
+    def _read(self) -> None:
+        try:
+            while not self._closed.is_set() and (job := self._source()) is not None:
+                if self._stage(self._stages.prepare, job[1], *job):
+                    continue
+                while not self._closed.is_set():
+                    with contextlib.suppress(queue.Full):
+                        self._ahead.put(job, timeout=TICK)
+                        break
+        except BaseException as error:
+            self._failure = error
+        while not self._closed.is_set():
+            with contextlib.suppress(queue.Full):
+                self._ahead.put(None, timeout=TICK)
+                return
+
+    def _write(self) -> None:
+        while not self._closed.is_set():
+            try:
+                job = self._behind.get(timeout=TICK)
+            except queue.Empty:
+                continue
+            if job is None:
+                return
+            with self._lock:
+                if self._closed.is_set():
+                    return
+                value = self._held.pop(job[0])
+            try:
+                self._stage(self._stages.write, value, *job)
+            except BaseException as error:  # of emit
+                self._failure = error
+
+    def _undo(self, value: Any) -> None:
+        with contextlib.suppress(Exception):
+            self._stages.abandon(value)
+
+    def _close(self, writer: threading.Thread) -> None:
+        """Lets what is being written end, and abandons the rest."""
+        with self._lock:
+            self._closed.set()
+            held, self._held = list(self._held.values()), {}
+        for value in held:
+            self._undo(value)
+        writer.join(PATIENCE)
+
+
+def _here(stages: Stages, items: Iterable[Any], on_result: Callable[[Any], None], interrupts: _Interrupts) -> None:
+    """One pipeline in this process; it computes in this thread, where Ctrl-C is heard."""
+    source = enumerate(items)
+    results: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def idle() -> None:
+        interrupts.look()
+        with contextlib.suppress(queue.Empty):
+            while True:
+                on_result(results.get_nowait())
+
+    pipeline = Pipeline(stages, lambda: None if interrupts.stop.is_set() else next(source, None),
+                        lambda ticket, item, result: results.put(result))
+    try:
+        pipeline.run(idle)
+    finally:
+        idle()
+
+
+# ---------------------------------------------------------------------------------------------- worker processes
+
+
+def _serve(stages: Stages, connection: Connection) -> None:
+    """A worker process: asks for an item whenever it can read one, until the other end closes or SIGTERM comes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked when it started
+    signal.signal(signal.SIGTERM, lambda number, frame: _leave())
+    sending = threading.Lock()
+    warm = False
+
+    def send(kind: str, ticket: int, value: bytes | str) -> None:
+        with sending, contextlib.suppress(OSError):  # nobody listens any more: the end of the source comes next
+            connection.send_bytes(pickle.dumps((kind, ticket, value)))
+
+    def source() -> tuple[int, Any] | None:
+        while True:
+            send("next", 0, "")
+            try:
+                ticket, blob = pickle.loads(connection.recv_bytes())
+            except (EOFError, OSError):
+                return None
+            try:
+                return ticket, pickle.loads(blob)
+            except Exception as error:
+                send("failed", ticket, f"a worker cannot read the item: {_message(error)}")
+
+    def emit(ticket: int, item: Any, result: Any) -> None:
+        try:
+            blob = pickle.dumps(result)
+        except Exception as error:
+            send("failed", ticket, f"its result cannot be sent: {_message(error)}")
+        else:
+            send("result", ticket, blob)
+
+    def idle() -> None:
+        nonlocal warm
+        if not warm and computed.is_set():
+            warm = True
+            send("warm", 0, "")
+
+    computed = threading.Event()
+    pipeline = Pipeline(_Marked(stages, computed).stages(), source, emit)
+    pipeline.run(idle)
+
+
+@dataclass(frozen=True)
+class _Marked:
+    """Stages that tell when the first computation, with its kernels to build, is over."""
+
+    inner: Stages
+    computed: threading.Event
+
+    def stages(self) -> Stages:
+        def compute(value: Any) -> Any:
+            try:
+                return self.inner.compute(value)
+            finally:
+                self.computed.set()
+
+        return Stages(self.inner.prepare, compute, self.inner.write, self.inner.abandon, self.inner.failed,
+                      self.inner.result)
+
+
+def _leave() -> None:
+    raise SystemExit(128 + signal.SIGTERM)
+
+
+class _Worker:
+    """A worker process and what it has in hand."""
+
+    def __init__(self, number: int, process: Any, connection: Connection) -> None:
+        self.number = number
+        self.process = process
+        self.connection = connection
+        self.items: dict[int, Any] = {}
+        self.wants = False
+        self.heard = False
+        self.alone = False  # it has an item that an earlier worker died of, and gets no other
+
+
+class _Crew:
+    """The worker processes of a run."""
+
+    def __init__(self, stages: Stages, items: Iterable[Any], count: int, on_result: Callable[[Any], None],
+                 tell: Callable[[str], None], interrupts: _Interrupts) -> None:
+        self.stages = stages
+        self.source = enumerate(items)
+        self.count = count
+        self.on_result = on_result
+        self.tell = tell
+        self.interrupts = interrupts
+        self.workers: list[_Worker] = []
+        self.again: deque[tuple[int, Any]] = deque()  # items whose worker died
+        self.ended = False  # the source
+        self.failure: BaseException | None = None
+        self.warm = False
+        self.results = 0
+        self.stillborn = 0
+        self.began = time.monotonic()
+
+    def run(self) -> None:
+        try:
+            for number in range(self.count):
+                self.workers.append(self._start(number))
+            while True:
+                stopping = self.interrupts.look()
+                if not stopping:
+                    self._hand_out()
+                if not any(worker.items for worker in self.workers) and (stopping or (self.ended and not self.again)):
+                    break
+                self._listen()
+        except BaseException:
+            self._end(at_once=True)
+            raise
+        self._end(at_once=False)
+        if self.failure is not None:
+            raise self.failure
+
+    def _start(self, number: int) -> _Worker:
+        context = multiprocessing.get_context("spawn")  # a fork of a process with OpenCL in it hangs
+        ours, theirs = context.Pipe()
+        # The first few have a core more where they do not divide evenly.
+        share = max(cores() // self.count + (number < cores() % self.count), 1)
+        process = context.Process(target=_serve, args=(self.stages, theirs), name=f"whitefurnace worker {number}",
+                                  daemon=True)
+        with self.interrupts.held(), _environment(core_limit(share)):
+            process.start()
+        theirs.close()
+        return _Worker(number, process, ours)
+
+    def _next(self) -> tuple[int, Any] | None:
+        if self.ended:
+            return None
+        try:
+            job = next(self.source, None)
+        except Exception as error:  # told when what is in flight is done
+            job, self.failure = None, error
+        self.ended = job is None
+        return job
+
+    def _hand_out(self) -> None:
+        """Gives each worker that can read one an item: new ones first, then those that cost a worker its life."""
+        for worker in self.workers:
+            # One goes first: the kernels that it builds are in the compiler's cache for the others.
+            self.warm = self.warm or time.monotonic() - self.began > FIRST_SECONDS
+            if not worker.wants or worker.alone or (worker.number and not self.warm):
+                continue
+            job = self._next()
+            if job is None and self.again and not worker.items:
+                job, worker.alone = self.again.popleft(), True
+            if job is None:
+                continue
+            ticket, item = job
+            try:
+                blob = pickle.dumps((ticket, pickle.dumps(item)))
+            except Exception as error:
+                worker.alone = False
+                self._result(self.stages.failed(item, f"it cannot be sent: {_message(error)}", _code(error)))
+                continue
+            worker.items[ticket] = item
+            worker.wants = False
+            with contextlib.suppress(OSError):  # it died: its sentinel says so
+                worker.connection.send_bytes(blob)
+
+    def _result(self, result: Any) -> None:
+        self.results += 1
+        self.warm = self.warm or self.results >= FIRST
+        self.on_result(result)
+
+    def _listen(self) -> None:
+        """Waits a moment for messages and deaths."""
+        ready = wait([thing for worker in self.workers for thing in (worker.connection, worker.process.sentinel)], TICK)
+        for place, worker in enumerate(self.workers):
+            dead = worker.process.sentinel in ready
+            if dead or worker.connection in ready:
+                self._hear(worker)
+            if dead:
+                self.workers[place] = self._bury(worker)
+
+    def _hear(self, worker: _Worker) -> None:
+        with contextlib.suppress(EOFError, OSError):  # the last message of a killed worker may be cut short
+            while worker.connection.poll():
+                kind, ticket, value = pickle.loads(worker.connection.recv_bytes())
+                worker.heard = True
+                if kind == "next":
+                    worker.wants = True
+                elif kind == "warm":
+                    self.warm = True
+                else:
+                    item = worker.items.pop(ticket)
+                    worker.alone = False
+                    try:
+                        result = pickle.loads(value) if kind == "result" else self.stages.failed(item, value, 2)
+                    except Exception as error:
+                        result = self.stages.failed(item, f"its result cannot be read: {_message(error)}", 2)
+                    self._result(result)
+
+    def _bury(self, worker: _Worker) -> _Worker:
+        """Another worker in its place. Its items, all of them suspects, are tried once more, each alone."""
+        worker.process.join()
+        code = worker.process.exitcode or 0
+        cause = f"was killed (signal {-code})" if code < 0 else f"ended (exit code {code})"
+        worker.connection.close()
+        self.stillborn = 0 if worker.heard else self.stillborn + 1
+        if self.stillborn > 2:
+            raise DeviceError(f"worker processes end before they begin: the last {cause}")
+        if not self.interrupts.stop.is_set():
+            for ticket, item in worker.items.items():
+                if worker.alone:
+                    self._result(self.stages.failed(item, f"the worker that had it {cause}, twice", 2))
+                else:
+                    self.again.append((ticket, item))
+            if not worker.alone:
+                count = len(worker.items)
+                again = "its item is" if count == 1 else f"its {count} items are"
+                self.tell(f"worker {worker.number} {cause}" + (f"; {again} tried again" if count else ""))
+        return self._start(worker.number)
+
+    def _end(self, at_once: bool) -> None:
+        """Lets the workers go: they end when their pipe closes; at once by SIGTERM, then by force."""
+        for worker in self.workers:
+            worker.connection.close()
+            if at_once:
+                worker.process.terminate()
+        # A worker may still hold a thread in a driver's call.
+        deadline = time.monotonic() + 2 * PATIENCE
+        for worker in self.workers:
+            worker.process.join(max(deadline - time.monotonic(), 0))
+            if worker.process.is_alive():
+                worker.process.kill()
+                worker.process.join()
+
+
+_environment_lock = threading.Lock()
+
+
+@contextlib.contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Variables that a process started meanwhile inherits."""
+    with _environment_lock:
+        before = {name: os.environ.get(name) for name in values}
+        os.environ.update(values)
+        try:
+            yield
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    del os.environ[name]
+                else:
+                    os.environ[name] = value
+
+
+# ---------------------------------------------------------------------------------------------- a Dask cluster
+
+
+class _Service:
+    """The pipeline of a Dask worker, which its task threads share; its own thread computes."""
+
+    def __init__(self, stages: Stages) -> None:
+        self._jobs: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
+        self._waiting: dict[int, Future[Any]] = {}
+        self._tickets = itertools.count()
+        self._pipeline = Pipeline(stages, self._jobs.get, self._emit)
+        threading.Thread(target=self._run, name="compute", daemon=True).start()
+
+    def _run(self) -> None:
+        error: BaseException = RuntimeError("the pipeline ended")
+        try:
+            self._pipeline.run()
+        except BaseException as raised:
+            error = raised
+        with _services_lock:
+            for stages in [stages for stages, service in _services.items() if service is self]:
+                del _services[stages]
+        for future in list(self._waiting.values()):
+            future.set_exception(RuntimeError(_message(error)))
+
+    def _emit(self, ticket: int, item: Any, result: Any) -> None:
+        self._waiting.pop(ticket).set_result(result)
+
+    def do(self, item: Any) -> Any:
+        ticket, future = next(self._tickets), Future[Any]()
+        self._waiting[ticket] = future
+        self._jobs.put((ticket, item))
+        return future.result()
+
+
+_services: dict[Stages, _Service] = {}
+_services_lock = threading.Lock()
+
+
+def _do(stages: Stages, item: Any, version: str) -> Any:
+    """The task of an item, on a Dask worker."""
+    if version != VERSION:
+        return stages.failed(item, f"its worker has whitefurnace {VERSION}, the batch {version}",
+                             UnsupportedError.exit_code)
+    with _services_lock:
+        if stages not in _services:
+            _services[stages] = _Service(stages)
+        service = _services[stages]
+    result = service.do(item)
+    try:
+        pickle.dumps(result)
+    except Exception as error:
+        return stages.failed(item, f"its result cannot be sent: {_message(error)}", _code(error))
+    return result
+
+
+@dataclass(frozen=True)
+class _Call:
+    """Is done where it is unpickled: a scheduler unpickles tasks too, and need not have this package installed."""
+
+    stages: Stages
+    item: Any
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _do, (self.stages, self.item, VERSION)
+
+
+def _settle(beside: Mapping[str, int], dask_worker: Any) -> str:
+    """Divides a machine's cores among its workers, before OpenCL is loaded there; the version of this package."""
+    count = beside.get(dask_worker.address, 1)
+    if count > 1:
+        os.environ.update(core_limit(max(cores() // count, 1)))
+    return VERSION
+
+
+def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: Callable[[Any], None],
+                tell: Callable[[str], None], interrupts: _Interrupts) -> None:
+    try:
+        import distributed
+    except ImportError as error:
+        raise UnsupportedError("a scheduler needs Dask: pip install 'whitefurnace[dask]'") from error
+    loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL)  # what it would print of a lost scheduler we tell in a sentence
+    try:
+        try:
+            client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        except (OSError, TimeoutError) as error:
+            raise FileError(f"no scheduler answers at {address}") from error
+        except (ValueError, TypeError) as error:
+            raise UsageError(f"{address!r} is no address of a scheduler: {error}; e.g. tcp://host:8786") from error
+        cluster = _Cluster(stages, items, address, client, on_result, tell, interrupts)
+        try:
+            cluster.run()
+        except BaseException:
+            with contextlib.suppress(Exception):
+                client.cancel(list(cluster.flying), force=True)
+            raise
+        finally:
+            with contextlib.suppress(Exception):
+                client.close(timeout=PATIENCE)
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+class _Cluster:
+    """A run on a Dask cluster; at no time are more than WINDOW items a worker submitted."""
+
+    def __init__(self, stages: Stages, items: Iterable[Any], address: str, client: Any,
+                 on_result: Callable[[Any], None], tell: Callable[[str], None], interrupts: _Interrupts) -> None:
+        self.stages = stages
+        self.source = enumerate(items)
+        self.address = address
+        self.client = client
+        self.on_result = on_result
+        self.tell = tell
+        self.interrupts = interrupts
+        self.flying: dict[Any, Any] = {}  # future -> item
+        self.landed: queue.SimpleQueue[Any] = queue.SimpleQueue()
+        self.settled: set[str] = set()
+        self.done = 0
+        self.window = 0
+        self.looked = -1e9
+        self.lonely = False
+
+    def run(self) -> None:
+        ended, failure = False, None
+        while True:
+            stopping = self.interrupts.look()
+            if not stopping and not ended:
+                self._look()
+            while not stopping and not ended and len(self.flying) < self.window:
+                try:
+                    job = next(self.source, None)
+                except Exception as error:
+                    job, failure = None, error
+                if job is None:
+                    ended = True
+                else:
+                    self._submit(job[1])
+            if not self.flying and (stopping or ended):
+                break
+            self._land()
+        if failure is not None:
+            raise failure
+
+    def _gone(self) -> FileError:
+        done = "1 item was" if self.done == 1 else f"{self.done} items were"
+        return FileError(f"the scheduler at {self.address} is gone: {done} done before; run it again to go on with the "
+                         f"rest")
+
+    def _look(self) -> None:
+        """Every few seconds: which workers there are, new ones told of their cores."""
+        now = time.monotonic()
+        if now - self.looked < 2:
+            return
+        if self.client.status != "running":
+            raise self._gone()
+        self.looked = now
+        try:
+            workers = self.client.scheduler_info(n_workers=-1)["workers"]
+        except Exception as error:
+            raise self._gone() from error
+        able = {name: facts["host"] for name, facts in workers.items() if facts["resources"].get(RESOURCE, 0) >= SHARE}
+        if not able and not self.lonely:
+            self.lonely = True
+            self.tell(f"waiting: no worker at {self.address} declares {RESOURCE}=1 "
+                      f"(dask worker {self.address} --nthreads 4 --resources {RESOURCE}=1)")
+        fresh = [name for name in able if name not in self.settled]
+        if fresh:
+            hosts = list(able.values())
+            versions = self.client.run(_settle, {name: hosts.count(host) for name, host in able.items()},
+                                       workers=fresh, on_error="return")
+            for name, version in versions.items():
+                if isinstance(version, ImportError):
+                    raise UnsupportedError(f"the worker {name} has no whitefurnace {VERSION}: install it there "
+                                           f"({_message(version)})")
+                if isinstance(version, str) and version != VERSION:
+                    raise UnsupportedError(f"the worker {name} has whitefurnace {version}, this is {VERSION}: install "
+                                           f"the same on both")
+            self.settled.update(fresh)
+        self.window = WINDOW * len(able)
+
+    def _submit(self, item: Any) -> None:
+        try:
+            sent = self.stages.load(item) if self.stages.load is not None else item
+            call = pickle.dumps(_Call(self.stages, sent))
+            future = self.client.submit(pickle.loads, call, pure=False, resources={RESOURCE: SHARE})
+        except Exception as error:
+            if self.client.status != "running":
+                raise self._gone() from error
+            self._result(self.stages.failed(item, f"it cannot be sent: {_message(error)}", _code(error)))
+            return
+        self.flying[future] = item
+        future.add_done_callback(self.landed.put)
+
+    def _result(self, result: Any) -> None:
+        self.done += 1
+        self.on_result(result)
+
+    def _land(self) -> None:
+        """Waits a moment for results and takes all that are there."""
+        landed = []
+        with contextlib.suppress(queue.Empty):
+            landed.append(self.landed.get(timeout=TICK))
+            while True:
+                landed.append(self.landed.get_nowait())
+        if self.client.status != "running" or any(future.status in ("cancelled", "lost") for future in landed):
+            raise self._gone()
+        whole = [future for future in landed if future.status == "finished"]
+        try:
+            values = dict(zip(whole, self.client.gather(whole), strict=True)) if whole else {}
+        except Exception as error:
+            if self.client.status != "running":
+                raise self._gone() from error
+            values = {}
+        for future in landed:
+            item = self.flying.pop(future)
+            if future in values:
+                result = values[future]
+            else:
+                result = self.stages.failed(item, _why(future), 2)
+            future.release()
+            self._result(result)
+
+
+def _why(future: Any) -> str:
+    """One line why a task has no result."""
+    try:
+        error = future.exception(timeout=PATIENCE)
+    except Exception as unreadable:
+        error = unreadable
+    if type(error).__name__ == "KilledWorker":  # after the scheduler's distributed.scheduler.allowed-failures
+        return "every worker that had it was killed"
+    return _message(error) if error is not None else "its result cannot be read"

@@ -1,0 +1,1 @@
+"""Measures the throughput of kernels and the trade of error against time."""

@@ -1,0 +1,219 @@
+"""Error against time of the prefilter: every method and quality on an environment, the best of them, and what makes a
+level dear: the size of the output, of the source, and α."""
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+from whitefurnace.baking.bake import DEMO, demo
+from whitefurnace.benching.throughput import Spread
+from whitefurnace.errors import CheckError
+from whitefurnace.opencl.device import Device
+from whitefurnace.prefiltering import lighting
+from whitefurnace.prefiltering import plan as planning
+from whitefurnace.prefiltering.convolution import Convolver
+from whitefurnace.prefiltering.means import Means
+from whitefurnace.prefiltering.recipe import QUALITIES, Chain, chain
+from whitefurnace.sphere.environments import Environment, environment
+from whitefurnace.sphere.grids import Shape
+
+TOLERANCES = (1e-2, 3e-3, 1e-3, 1e-4, 2e-5)
+SAMPLES = (32, 128, 512, 2048, 16384)
+RUNS = 5
+BUDGET = 3.0
+"""Seconds of one point: its runs after the first end where they have taken so long. Where the first takes longer, it is
+the only one, with kernels that cheaper points have built."""
+
+COST_TOLERANCE = QUALITIES["normal"]
+SIZES = (64, 128, 256, 512)
+ROWS = (256, 512, 1024, 2048)
+ALPHAS = (1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 1.0)
+LEVEL = 64
+"""Face edge of the one level whose cost is measured over α."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """A chain by one method at one setting: seconds from texels in memory to finished levels, the `certificate` apart;
+    `error`, `worst` and `rmse` of its worst level, as stated; `front` where no other is both faster and better."""
+
+    environment: str
+    method: str  # "tolerance" or "samples"
+    setting: float
+    seconds: Spread
+    certificate: float
+    error: float
+    worst: float
+    rmse: float
+    evaluations: int
+    rules: tuple[str, ...]
+    runs: int
+    front: bool = False
+
+    @property
+    def label(self) -> str:
+        """The setting for people, with the quality that asks for it."""
+        if self.method == "samples":
+            return f"{self.setting:.0f}"
+        quality = {tolerance: name for name, tolerance in QUALITIES.items()}.get(self.setting)
+        return f"{self.setting:g}" + (f" {quality}" if quality else "")
+
+
+@dataclass(frozen=True)
+class Missed:
+    """A point or a cost (`method` is then what it is over) that could not be made, and why."""
+
+    environment: str
+    method: str
+    setting: float
+    why: str
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Seconds at COST_TOLERANCE as one thing varies: `over` "output size" (face edge of level 0), "source rows" (of a
+    lat-long) or "alpha" (one level of LEVEL² texels)."""
+
+    environment: str
+    over: str
+    value: float
+    seconds: Spread
+    runs: int
+
+
+def front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the Pareto front of (cost, error), cheapest first: those that no other one beats in one of the two
+    without losing in the other. Of equal points the first counts; NaN is on no front."""
+    best, found = math.inf, []
+    for k in sorted(range(len(points)), key=lambda k: points[k]):
+        cost, error = points[k]
+        if math.isfinite(cost) and error < best:
+            best = error
+            found.append(k)
+    return found
+
+
+def load(source: str, device: Device) -> Environment:
+    """An environment in memory: a path, or the word `demo`."""
+    if source == DEMO and not os.path.exists(source):
+        return replace(demo(device), name=DEMO)
+    return environment(source)
+
+
+def check(size: int, min_size: int) -> None:
+    """Raises UsageError for sizes that no chain has."""
+    chain(size=size, min_size=min_size)
+
+
+def _repeated(measure: Callable[[], Any], runs: int, budget: float) -> list[Any]:
+    """What `measure` gave, the first time left out."""
+    begin = time.perf_counter()
+    found = [measure()]
+    if time.perf_counter() - begin > budget:
+        return found
+    found.clear()
+    begin = time.perf_counter()
+    while len(found) < runs and (not found or time.perf_counter() - begin < budget):
+        found.append(measure())
+    return found
+
+
+def _prefilter(env: Environment, device: Device, **options: Any) -> tuple[lighting.Prefiltered, float, float]:
+    """The chain, seconds from texels to levels, and seconds of the certificate."""
+    made = lighting.prefilter(env, device=device, **options)
+    return made, made.timings["source"] + made.timings["levels"], made.timings["certificate"]
+
+
+def methods() -> list[tuple[str, float]]:
+    """(method, setting) of every point."""
+    return [*(("tolerance", x) for x in TOLERANCES), *(("samples", n) for n in SAMPLES)]
+
+
+def points(env: Environment, device: Device, *, size: int = 256, min_size: int = 16, runs: int = RUNS,
+           budget: float = BUDGET, todo: Sequence[tuple[str, float]] | None = None,
+           progress: Callable[[str, float], None] | None = None) -> Iterator[Point | Missed]:
+    """Every method and setting on one environment, each measured where it can be made."""
+    todo = methods() if todo is None else todo
+    for k, (method, setting) in enumerate(todo):
+        if progress:
+            progress(f"{method} {setting:g}", k / len(todo))
+        value = int(setting) if method == "samples" else setting
+        options: dict[str, Any] = {method: value, "size": size, "min_size": min_size}
+        try:
+            found = _repeated(partial(_prefilter, env, device, **options), runs, budget)
+        except CheckError as error:
+            yield Missed(env.name, method, setting, str(error))
+            continue
+        made = found[0][0]
+        yield Point(env.name, method, setting, Spread.of([seconds for _, seconds, _ in found]),
+                    Spread.of([certificate for _, _, certificate in found]).median, float(made.error.max()),
+                    float(made.worst.max()), float(made.rmse.max()), made.evaluations, made.rule, len(found))
+
+
+def with_front(measured: Sequence[Point]) -> list[Point]:
+    """The points of one environment, those on the front marked."""
+    best = set(front([(p.seconds.median, p.error) for p in measured]))
+    return [replace(p, front=k in best) for k, p in enumerate(measured)]
+
+
+@dataclass(frozen=True)
+class _One(Chain):
+    """A chain of one level, at any roughness."""
+
+    roughness: float = 1.0
+
+    @property
+    def levels(self) -> tuple[tuple[int, float], ...]:
+        return ((self.size, self.roughness),)
+
+
+def _level(env: Environment, device: Device, size: int, alpha: float, tolerance: float = COST_TOLERANCE) -> float:
+    """Seconds of one level alone, from texels in memory, without its certificate."""
+    recipe = _One(chain(size=size, min_size=size).ndf, size, size, tolerance,
+                  roughness=math.sqrt(alpha))
+    begin = time.perf_counter()
+    convolver = Convolver(device, env, precision=planning.precision_for(tolerance))
+    job, = lighting.chain_jobs(convolver, recipe)
+    assert job.lobe is not None
+    convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance)
+    return time.perf_counter() - begin
+
+
+def resampled(env: Environment, device: Device, rows: int) -> Environment:
+    """The same light as a lat-long of `rows` rows, each texel the exact mean over its solid angle."""
+    return replace(environment(Means(device, env.texels, env.rotation).level(Shape(True, rows))), name=env.name)
+
+
+def costs(env: Environment, device: Device, *, size: int = 256, min_size: int = 16, runs: int = RUNS,
+          budget: float = BUDGET, sizes: Sequence[int] = SIZES, rows: Sequence[int] = ROWS,
+          alphas: Sequence[float] = ALPHAS,
+          progress: Callable[[str, float], None] | None = None) -> Iterator[Cost | Missed]:
+    """What a chain costs from `sizes` and `rows` of the source, and a level over α, at COST_TOLERANCE."""
+
+    def whole(some: Environment, size: int) -> float:
+        return _prefilter(some, device, tolerance=COST_TOLERANCE, size=size, min_size=min(min_size, size), certify=0)[1]
+
+    def measures() -> Iterator[tuple[str, float, Callable[[], float]]]:
+        for n in sizes:
+            yield "output size", n, partial(whole, env, n)
+        for height in rows:
+            some = resampled(env, device, height)
+            yield "source rows", height, partial(whole, some, size)
+        for alpha in alphas:
+            yield "alpha", alpha, partial(_level, env, device, min(LEVEL, size), alpha)
+
+    count = len(sizes) + len(rows) + len(alphas)
+    for k, (over, value, measure) in enumerate(measures()):
+        if progress:
+            progress(f"cost, {over} {value:g}", k / count)
+        try:
+            seconds = _repeated(measure, runs, budget)
+        except CheckError as error:
+            yield Missed(env.name, over, value, str(error))
+            continue
+        yield Cost(env.name, over, value, Spread.of(seconds), len(seconds))

@@ -1,0 +1,1 @@
+"""Presets: what each game engine loads, and the shader snippets that read it."""

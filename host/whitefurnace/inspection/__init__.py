@@ -1,0 +1,1 @@
+"""Explains files that engines load and compares two of them."""

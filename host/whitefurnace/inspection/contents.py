@@ -1,0 +1,636 @@
+"""Any file that we or an engine know, brought into one shape: levels as floats, spherical harmonics, texts, facts of
+the header, and what we stated of it where it is ours."""
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.engines.presets import ENGINES, HOLDS, Engine, File, axes_matrix
+from whitefurnace.errors import FileError, InputError, UsageError
+from whitefurnace.files import (
+    Light,
+    digest_file,
+    image_facts,
+    is_arrays,
+    is_light,
+    read_header,
+    read_image,
+    read_light,
+    read_manifest,
+    read_npy,
+    read_npz,
+    read_rgbd,
+    read_sh,
+    read_stored,
+)
+from whitefurnace.sphere.environments import cube_solid_angles, faces_of, latlong_solid_angles
+from whitefurnace.sphere.harmonics import SCALINGS, unscaled
+
+KINDS = ("cube", "cube array", "lat-long", "image", "image array", "table", "arrays", "harmonics", "code",
+         "manifest")
+FIGURES = ("error", "worst", "rmse", "format_p99", "format_worst")
+"""What a manifest tells of a level: the filter's error, and what the pixel format adds."""
+
+PREFIX = "whitefurnace:"
+"""Of our own key-values and attributes."""
+
+CONTAINERS = {".ktx": "KTX 1", ".ktx2": "KTX 2", ".dds": "DDS", ".env": "Babylon .env", ".gltf": "glTF"}
+TITLES = {"openexr": "OpenEXR", "hdr": "Radiance HDR", "png": "PNG", "tiff": "TIFF", "jpeg": "JPEG", "dds": "DDS"}
+
+
+@dataclass(frozen=True)
+class Level:
+    """One mip, table or array. `texels` float32: (6, n, n, c) or (h, w, c), an array of either with an axis before;
+    `roughness` perceptual, where the file or its manifest tells it; `stored` its bytes in the file, where it has bytes
+    of its own; `stated` our own figures (error, worst, rmse)."""
+
+    name: str
+    texels: np.ndarray
+    roughness: float | None = None
+    stored: int | None = None
+    stated: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """The face edge of a cube, the height of anything else."""
+        return self.texels.shape[-3]
+
+
+@dataclass(frozen=True)
+class Statement:
+    """What we said of a file of ours: `manifest` is the one that lists it, None where only the file's own attributes
+    speak; `whole` whether that manifest's digest is the file's."""
+
+    manifest: Path | None
+    whole: bool | None
+    told: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What a file holds.
+
+    kind         one of KINDS
+    container    "KTX 2", "DDS", "OpenEXR", "npz" …; `format` the pixel format in words
+    levels       the first the largest; what is prefiltered lies GL-direct
+    irradiance   (6, n, n, 3) E/π, where the file has it apart
+    sh           (9, 3) radiance coefficients in the project's basis, whatever scale the file has them in
+    dfg          (h, w, c), a table beside levels
+    keys         texts of the file: key-values, attributes
+    facts        of the header, ready to be shown
+    largest      the largest finite value that each channel of the format holds; () where that is no limit to meet
+    """
+
+    path: Path
+    kind: str
+    container: str
+    format: str
+    levels: tuple[Level, ...]
+    irradiance: Level | None = None
+    sh: np.ndarray | None = None
+    dfg: Level | None = None
+    keys: Mapping[str, str] = field(default_factory=dict)
+    facts: Mapping[str, str | int] = field(default_factory=dict)
+    largest: tuple[float, ...] = ()
+    statement: Statement | None = None
+    notices: tuple[str, ...] = ()
+
+    @property
+    def written_for(self) -> tuple[str, str] | None:
+        """The engine that it was written for and the axes of that, where its manifest or its keys say so: a user's as
+        the bake was given it."""
+        told = self.statement.told if self.statement is not None else {}
+        name = self.keys.get(f"{PREFIX}engine", told.get("engine"))
+        if not isinstance(name, str):
+            return None
+        axes: Any = told
+        for part in ("recipe", "engines", name, "engine", "axes"):
+            axes = axes.get(part) if isinstance(axes, Mapping) else None
+        if name in ENGINES and not isinstance(axes, str):
+            axes = ENGINES[name].axes
+        try:
+            axes_matrix(axes if isinstance(axes, str) else "")
+        except UsageError:
+            return None
+        return name, axes
+
+    @property
+    def holds(self) -> str | None:
+        """What its manifest says that it is: one of engines.HOLDS; a strip of ours with harmonics is irradiance."""
+        told = self.statement.told if self.statement is not None else {}
+        if self.container == "OpenEXR" and self.sh is not None:
+            return "irradiance"
+        return told["holds"].split(",")[0] if isinstance(told.get("holds"), str) else None
+
+    @property
+    def cube(self) -> bool:
+        return self.kind in ("cube", "cube array")
+
+
+def contents(path: str | os.PathLike[str]) -> Contents:
+    """What is in a file: our .npz, .npy, .exr and manifests, KTX 1, KTX 2, DDS, Babylon .env, glTF, and images.
+
+    Raises `FileError` for what cannot be read, `InputError` for what is not valid or not known. What cannot be
+    decoded here for want of a package has no levels, and a notice.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise FileError(f"cannot read {path}: it is a folder, a file was expected")
+    if path.suffix.lower() == ".json" and not _is_harmonics(path):
+        return _of_manifest(path)
+    statement = _statement(path)
+    if path.suffix.lower() in (".txt", ".json"):
+        return _of_harmonics(path, statement)
+    if path.suffix.lower() == ".h":
+        return _of_header(path, statement)
+    if is_arrays(path):
+        return _of_arrays(path, statement)
+    if is_light(path):
+        return _of_light(path, statement)
+    return _of_image(path, statement)
+
+
+# ------------------------------------------------------------------------------------------------- by container
+
+
+def _of_manifest(path: Path) -> Contents:
+    try:
+        size = path.stat().st_size
+        with open(path, "rb"):
+            pass
+    except (OSError, ValueError) as error:
+        raise FileError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
+    found = read_manifest(path)
+    if found is None:
+        raise InputError(f"{path} is not a manifest of whitefurnace, which is JSON and begins with its version")
+    files = _files(found)
+    if isinstance(found.get("sha256"), str):  # of a table, beside its file
+        files = {path.name.removesuffix(".json"): found}
+    whole = bool(files) and all(_is(path.parent / name, entry) for name, entry in files.items())
+    facts: dict[str, str | int] = {"lists": ", ".join(sorted(files)) or "no files", "bytes": size}
+    return Contents(path, "manifest", "JSON", "a manifest of whitefurnace", (), sh=_manifest_sh(found), facts=facts,
+                    statement=Statement(path, whole, _told(found)))
+
+
+def _is_harmonics(path: Path) -> bool:
+    """Whether JSON holds nine coefficients by name, and is no manifest."""
+    try:
+        read_sh(path)
+    except (FileError, InputError):
+        return False
+    return True
+
+
+def _of_harmonics(path: Path, statement: Statement | None) -> Contents:
+    """A text of nine coefficients. Filament's cmgen names the scale in its lines; else a manifest does."""
+    values = read_sh(path)
+    told = statement.told.get("scale") if statement is not None else None
+    scale = told if isinstance(told, str) and told in SCALINGS else None
+    if scale is None and b"pre-scaled base" in path.read_bytes():
+        scale = "filament"
+    notices = () if scale else ("nothing says the scale of the coefficients; they are taken as the radiance's",)
+    return Contents(path, "harmonics", "text", f"9 × 3 coefficients, scale {scale or 'radiance'}", (),
+                    sh=unscaled(values, scale or "radiance"), facts={"bytes": path.stat().st_size},
+                    statement=statement, notices=notices)
+
+
+def _of_header(path: Path, statement: Statement | None) -> Contents:
+    """A table as a C array; or macros, which are not evaluated."""
+    array, facts = read_header(path), {"bytes": path.stat().st_size}
+    if array is None:
+        return Contents(path, "code", "C header", "macros", (), facts=facts, statement=statement)
+    level = Level("the table", _floats(path, array, "table"), stated=_numbers(statement, "error"))
+    form = f"an array of {' × '.join(map(str, array.shape))}"
+    return Contents(path, "table", "C header", form, (level,), facts=facts, statement=statement)
+
+
+def _of_arrays(path: Path, statement: Statement | None) -> Contents:
+    size = path.stat().st_size
+    if path.suffix.lower() == ".npy" or not (arrays := read_npz(path)):
+        array = read_npy(path)
+        table = _is_table(statement)
+        form = f"{array.dtype.name}, array of {' × '.join(map(str, array.shape)) or '1'}"
+        kind = "table" if table else _kind_of(array.shape)
+        level = Level("the table" if kind == "table" else "level 0", _floats(path, array, kind), stored=array.nbytes,
+                      stated=_numbers(statement, "error"))
+        return Contents(path, kind, "npy", form, (level,), facts={"bytes": size}, statement=statement)
+    names = list(arrays)
+    form = " and ".join(sorted({array.dtype.name for array in arrays.values()}))
+    facts: dict[str, str | int] = {"arrays": ", ".join(names), "bytes": size}
+    if "specular_0" not in arrays:
+        plain = tuple(Level(name, _floats(path, array, "arrays"), stored=array.nbytes)
+                      for name, array in arrays.items() if array.ndim >= 2)
+        return Contents(path, "arrays", "npz", form, plain, facts=facts, statement=statement)
+    levels: list[Level] = []
+    while f"specular_{len(levels)}" in arrays:
+        k = len(levels)
+        array = arrays[f"specular_{k}"]
+        if array.ndim != 4 or array.shape[0] != 6 or array.shape[1] != array.shape[2] or not array.size:
+            raise InputError(f"{path} is not valid: its specular_{k} is an array of {array.shape}, (6, n, n, 3) was "
+                             "expected")
+        own = {str(name): float(arrays[name].ravel()[k]) for name in ("error", "worst", "rmse", "roughness")
+               if name in arrays and arrays[name].size > k}
+        levels.append(Level(f"level {k}", _floats(path, array, "cube"), own.pop("roughness", None), array.nbytes, own))
+
+    def part(name: str, ndim: int) -> Level | None:
+        array = arrays.get(name)
+        if array is None:
+            return None
+        square = ndim == 3 or (array.ndim == 4 and array.shape[0] == 6 and array.shape[1] == array.shape[2])
+        if array.ndim != ndim or not square or not array.size:
+            raise InputError(f"{path} is not valid: its {name} is an array of {array.shape}")
+        return Level(name, _floats(path, array, name), stored=array.nbytes,
+                     stated=_numbers(statement, "error", "worst", "rmse", within=name))
+
+    sh = arrays.get("sh")
+    if sh is not None and sh.shape != (9, 3):
+        raise InputError(f"{path} is not valid: its sh is an array of {sh.shape}, (9, 3) was expected")
+    return Contents(path, "cube", "npz", form, tuple(levels), part("irradiance", 4),
+                    None if sh is None else sh.astype(np.float64), part("dfg", 3), facts=facts, statement=statement)
+
+
+def _of_light(path: Path, statement: Statement | None) -> Contents:
+    light = read_light(path)
+    own = {key.removeprefix(PREFIX): value for key, value in light.keys.items() if key.startswith(PREFIX)}
+    if own and statement is None:
+        statement = Statement(None, None, {name: _value(text) for name, text in own.items()})
+    if light.undecoded:
+        kind = ("cube" if light.cube else "image") + (" array" if light.layers else "")
+        return Contents(path, kind, light.container, light.format, (), None, _light_sh(light), None, light.keys,
+                        light.facts, light.largest, statement, (light.undecoded,))
+    kind, placed, notices = _light_kind(light, statement)
+    roughness = _roughness_of(light, statement, placed)
+    stated = _levels_told(statement)
+    if own and not stated:  # an error a level
+        numbers = [_number(_value(word)) for word in own.get("error", "").split()]
+        stated = {k: {"error": number} for k, number in enumerate(numbers) if number is not None}
+    if kind == "table":
+        stated = {0: _numbers(statement, "error", "format_worst")}
+    levels = tuple(
+        Level("the table" if kind == "table" and k == 0 else f"level {k}", texels, r, stored,
+              _figures(stated.get(k, {})))
+        for k, (texels, r, stored) in enumerate(zip(placed, roughness, light.stored or [None] * len(placed),
+                                                    strict=False)))
+    irradiance = None if light.irradiance is None else Level("irradiance", light.irradiance)
+    return Contents(path, kind, light.container, light.format, levels, irradiance, _light_sh(light), None, light.keys,
+                    light.facts, light.largest, statement, notices)
+
+
+def _light_kind(light: Light, statement: Statement | None) -> tuple[str, Sequence[np.ndarray], tuple[str, ...]]:
+    """The kind, the levels as that kind has them, and what is to be said of it."""
+    first = light.levels[0]
+    if light.cube:
+        return "cube array" if light.layers else "cube", light.levels, ()
+    if _is_table(statement):
+        return "table", light.levels, ()
+    if light.layers:
+        return "image array", light.levels, ()
+    if first.shape[-1] == 2:
+        return "table", light.levels, ()
+    found = faces_of(first)
+    if found is None:
+        return "image", light.levels, ()
+    if found[0] == "latlong":
+        return ("lat-long" if first.shape[1] > 1 else "image"), light.levels, ()
+    if len(light.levels) > 1:
+        return "image", light.levels, ()
+    return "cube", (found[1],), (f"taken as a {found[0]}, by its aspect ratio",)
+
+
+def _of_image(path: Path, statement: Statement | None) -> Contents:
+    facts = image_facts(path)
+    told = dict(facts.attributes)
+    if statement is None and told:
+        statement = Statement(None, None, {**told, **_parsed(told)})
+    container = TITLES.get(facts.format, facts.format)
+    packed = f", {facts.compression}" if facts.compression else ""
+    form = f"{facts.pixel}, {len(facts.channels)} channels ({' '.join(facts.channels)}){packed}"
+    shown: dict[str, str | int] = {"width": facts.width, "height": facts.height, "bytes": path.stat().st_size}
+    keys = {name: str(value) for name, value in told.items() if name in ("method", "rule", "notices")}
+    largest = {"half": 65504.0, "uint8": 1.0, "uint16": 1.0}.get(facts.pixel)
+    limit = (largest,) * len(facts.channels) if largest else ()
+    if _is_table(statement) or "rule" in told or len(facts.channels) == 2:
+        stated = _figures(told) or _numbers(statement, "error", "format_worst")
+        level = Level("the table", _table_of(path, facts.format, statement), stated=stated)
+        limit = () if statement is not None and statement.told.get("format") == "rgbd" else limit
+        return Contents(path, "table", container, form, (level,), keys=keys, facts=shown, largest=limit,
+                        statement=statement)
+    image = read_image(path)
+    atlas = statement is not None and statement.told.get("layout") == "octahedral"
+    found = None if atlas else faces_of(image.pixels)
+    name, texels = found if found is not None else ("", image.pixels)
+    kind = "image" if not name or image.pixels.shape[:2] == (1, 1) else "lat-long" if name == "latlong" else "cube"
+    if name or atlas:
+        shown["layout"] = name or "octahedral maps of all levels"
+    row = {**_levels_told(statement).get(0, {}), **told}
+    level = Level("level 0", texels, _number(row.get("roughness")), None, _figures(row))
+    sh = told.get("sh")
+    return Contents(path, kind, container, form, (level,), None, _sh_text(sh) if isinstance(sh, str) else None,
+                    keys=keys, facts=shown, largest=limit, statement=statement, notices=image.notices)
+
+
+def _is_table(statement: Statement | None) -> bool:
+    """Whether a manifest says so: of `lut`, or of a bake's file."""
+    return statement is not None and ("integral" in statement.told or statement.told.get("holds") == "dfg")
+
+
+def _table_of(path: Path, container: str, statement: Statement | None) -> np.ndarray:
+    """The values of a table as its shader reads them; RGBD where the manifest says that it is."""
+    if container == "png" and statement is not None and statement.told.get("format") == "rgbd":
+        return read_rgbd(path)
+    return read_stored(path)
+
+
+def _kind_of(shape: tuple[int, ...]) -> str:
+    """What an array without a manifest looks like."""
+    if len(shape) == 4 and shape[0] == 6 and shape[1] == shape[2] and shape[3] in (1, 3, 4):
+        return "cube"
+    if len(shape) == 3 and shape[1] == 2 * shape[0] and shape[2] in (3, 4):
+        return "lat-long"
+    return "table"
+
+
+def _floats(path: Path, array: np.ndarray, kind: str) -> np.ndarray:
+    """float32 with a channel axis; tables of more than two axes as rows of the last two."""
+    if array.size == 0:
+        raise InputError(f"{path} is not valid: it holds an array of {array.shape}, without a value")
+    with np.errstate(over="ignore"):
+        found = np.array(array, np.float32, order="C")
+    if kind in ("cube", "irradiance", "lat-long", "dfg"):
+        return found
+    if found.ndim <= 2:
+        return found.reshape(1 if found.ndim < 2 else found.shape[0], -1, 1)
+    small = found.shape[-1] <= 4
+    return found.reshape(-1, *found.shape[-2:]) if small else found.reshape(-1, found.shape[-1], 1)
+
+
+# ------------------------------------------------------------------------------------------------- what we stated
+
+
+def _statement(path: Path) -> Statement | None:
+    """The manifest that lists this file: FILE.json beside a table; else that of a bake, STEM.json in this folder or the
+    one above, whose STEM the file's name begins with."""
+    beside = path.with_name(path.name + ".json")
+    found = _manifest(beside)
+    if found is not None and found.get("name") == path.name:
+        return Statement(beside, _is(path, found), _told(found))
+    stems = [path.name[:k] for k, c in enumerate(path.name) if c in "._-" and k]
+    for folder in (path.parent.absolute().parent, path.parent.absolute()):
+        for stem in reversed(stems):
+            manifest = folder / f"{stem}.json"
+            found = _manifest(manifest)
+            if found is None:
+                continue
+            relative = path.absolute().relative_to(folder).as_posix()
+            entry = _files(found).get(relative)
+            if entry is not None:
+                own = {name: value for name, value in entry.items() if name not in ("sha256", "bytes")}
+                engine = relative.split("/")[0] if "/" in relative else None
+                told = {name: value for name, value in _told(found).items() if name != "levels"}  # of the whole bake
+                return Statement(manifest, _is(path, entry), {**told, **own, "engine": engine})
+    return None
+
+
+def _manifest(path: Path) -> dict[str, Any] | None:
+    try:
+        return read_manifest(path)
+    except (FileError, ValueError):  # one that cannot be read proves nothing
+        return None
+
+
+def _files(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    found: dict[str, dict[str, Any]] = {}
+    for part in (manifest.get("kept"), manifest.get("files")):
+        if isinstance(part, dict):
+            found |= {name: entry for name, entry in part.items() if isinstance(entry, dict)}
+    return found
+
+
+def _is(path: Path, entry: Mapping[str, Any]) -> bool:
+    try:
+        return path.is_file() and digest_file(path) == entry.get("sha256")
+    except (FileError, OSError, ValueError):
+        return False
+
+
+def _told(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in manifest.items() if name not in ("files", "kept")}
+
+
+def _manifest_sh(manifest: Mapping[str, Any]) -> np.ndarray | None:
+    sh = manifest.get("sh")
+    return _sh(sh.get("coefficients")) if isinstance(sh, dict) else None
+
+
+def _sh_text(text: str) -> np.ndarray | None:
+    try:
+        return _sh(json.loads(text))
+    except (ValueError, RecursionError):
+        return None
+
+
+def _sh(given: Any) -> np.ndarray | None:
+    """(9, 3) numbers, or None."""
+    try:
+        values = np.array(given, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return None
+    return values if values.shape == (9, 3) else None
+
+
+def _value(text: str) -> Any:
+    """What a text says as JSON, else the text."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+
+
+def _parsed(told: Mapping[str, Any]) -> dict[str, Any]:
+    """The recipe, which attributes hold as JSON."""
+    try:
+        return {"recipe": json.loads(told["recipe"])} if isinstance(told.get("recipe"), str) else {}
+    except (ValueError, RecursionError):
+        return {}
+
+
+def _figures(row: Mapping[str, Any]) -> dict[str, float]:
+    return {name: number for name in FIGURES if (number := _number(row.get(name))) is not None}
+
+
+def _number(value: Any) -> float | None:
+    """A number that a file tells, None for anything else."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return None
+
+
+def _numbers(statement: Statement | None, *names: str, within: str = "") -> dict[str, float]:
+    told = dict(statement.told) if statement is not None else {}
+    if isinstance(told.get("stored"), Mapping):  # of `lut`: what the format of its values costs
+        told["format_worst"] = told["stored"].get("error")
+    row = told.get(within) if within else told
+    return {name: value for name, value in _figures(row).items() if name in names} if isinstance(row, Mapping) else {}
+
+
+def _levels_told(statement: Statement | None) -> dict[int, Mapping[str, Any]]:
+    """The rows that a manifest has of this file's levels, by number."""
+    rows = statement.told.get("levels") if statement is not None else None
+    return {k: row for k, row in enumerate(rows) if isinstance(row, Mapping)} if isinstance(rows, list) else {}
+
+
+def _roughness_of(light: Light, statement: Statement | None, levels: Sequence[np.ndarray]) -> list[float | None]:
+    """Of each level: the numbers of a key `roughness`, else the manifest's where its levels are of these sizes."""
+    if light.roughness is not None:
+        return list(light.roughness)
+    for key, value in light.keys.items():
+        if key.lower().rpartition(":")[2].removeprefix("whitefurnace.") == "roughness":
+            try:
+                numbers = [float(word) for word in value.replace(",", " ").split()]
+            except ValueError:
+                continue
+            if len(numbers) == len(levels) and all(math.isfinite(r) for r in numbers):
+                return list(numbers)
+    rows = _levels_told(statement)
+    if light.cube and len(rows) == len(levels) and all(row.get("size") == texels.shape[-3] for row, texels in
+                                                       zip(rows.values(), levels, strict=True)):
+        return [_number(row.get("roughness")) for row in rows.values()]
+    return [None] * len(levels)
+
+
+# ------------------------------------------------------------------------------------------------- harmonics
+
+
+def _light_sh(light: Light) -> np.ndarray | None:
+    """Radiance coefficients from whatever scale an engine has."""
+    if light.polynomials is not None:
+        return unscaled(np.asarray(light.polynomials, np.float64), "babylon")
+    if light.irradiance_sh is not None:
+        return unscaled(np.asarray(light.irradiance_sh, np.float64), "irradiance")
+    try:
+        numbers = np.array([float(word) for word in light.keys.get("sh", "").split()])
+    except ValueError:
+        return None
+    return unscaled(numbers.reshape(9, 3), "filament") if numbers.size == 27 else None
+
+
+# ------------------------------------------------------------------------------------------------- figures
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Of a level's colour channels, those of finite values: `low` and `high`, `mean` by channel over the sphere (a
+    table's over its cells); counts of NaN, infinite and negative values and of those `at_limit` of the format; `alpha`
+    the range of a fourth channel that is not 1 everywhere."""
+
+    low: float
+    high: float
+    mean: tuple[float, ...]
+    nan: int
+    infinite: int
+    negative: int
+    at_limit: int
+    alpha: tuple[float, float] | None = None
+
+
+def statistics(found: Contents, level: Level) -> Statistics:
+    """What can be counted in a level."""
+    texels = level.texels
+    alpha = None
+    if texels.shape[-1] == 4 and found.kind not in ("table", "arrays"):
+        coverage = texels[..., 3]
+        if not np.all(coverage == 1):
+            alpha = (float(np.nanmin(coverage)), float(np.nanmax(coverage))) if not np.isnan(coverage).all() else None
+        texels = texels[..., :3]
+    finite = np.isfinite(texels)
+    clean = texels if finite.all() else np.where(finite, texels, np.float32(0))
+    weights = _weights(found, level)
+    total = np.broadcast_to(weights, texels.shape[:-1])
+    means = []
+    for k in range(texels.shape[-1]):
+        weight = float((total * finite[..., k]).sum())
+        means.append(float((clean[..., k] * total).sum(dtype=np.float64)) / weight if weight else math.nan)
+    at = 0
+    for k, largest in enumerate(found.largest[:texels.shape[-1]]):
+        at += int(np.count_nonzero(clean[..., k] >= np.float32(largest)))
+    some = texels[finite]
+    low, high = (float(some.min()), float(some.max())) if some.size else (math.nan, math.nan)
+    nan = int(np.count_nonzero(np.isnan(texels)))
+    return Statistics(low, high, tuple(means), nan, int(finite.size - np.count_nonzero(finite)) - nan,
+                      int(np.count_nonzero(texels < 0)), at, alpha)
+
+
+def _weights(found: Contents, level: Level) -> np.ndarray:
+    if (found.cube or level is found.irradiance) and level.texels.ndim >= 4:
+        return cube_solid_angles(level.size)
+    if found.kind == "lat-long" and level is not found.dfg:
+        return latlong_solid_angles(*level.texels.shape[:2])[:, None]
+    return np.ones(())
+
+
+def described(found: Contents) -> dict[str, Any]:
+    """All of it as plain data, for a row: what `statistics` and `looks_like` say too."""
+    parts = [*found.levels, *(part for part in (found.irradiance, found.dfg) if part is not None)]
+    return {
+        "event": "contents", "file": str(found.path), "kind": found.kind, "container": found.container,
+        "format": found.format, **({"header": dict(found.facts)}),
+        "levels": [_row(found, level) for level in parts],
+        **({} if found.sh is None else {"sh": found.sh.tolist()}),
+        "keys": dict(found.keys), "looks_like": looks_like(found),
+        "statement": None if found.statement is None else {
+            **found.statement.told,
+            "manifest": None if found.statement.manifest is None else str(found.statement.manifest),
+            "whole": found.statement.whole},
+        "notices": list(found.notices),
+    }
+
+
+def _row(found: Contents, level: Level) -> dict[str, Any]:
+    said = statistics(found, level)
+    shape = level.texels.shape
+    faces = len(shape) >= 4 and (found.cube or level is found.irradiance)
+    size = f"{level.size}²" if faces else "×".join(str(n) for n in shape[-2:-4:-1])
+    return {"name": level.name, "shape": list(shape), "size": size, "bytes": level.stored, "roughness": level.roughness,
+            "low": said.low, "high": said.high, "mean": list(said.mean), "nan": said.nan, "infinite": said.infinite,
+            "negative": said.negative, "at_limit": said.at_limit,
+            "alpha": None if said.alpha is None else list(said.alpha), **level.stated}
+
+
+# ------------------------------------------------------------------------------------------------- whose is it
+
+
+def looks_like(found: Contents) -> list[str]:
+    """Which engines' files it may be, as far as its own bytes tell: `ENGINE: what that file holds`."""
+    if not found.levels:
+        return []
+    said = [f"{engine.name}: {HOLDS[file.holds]}" for engine in ENGINES.values() for file in engine.file
+            if _fits(found, engine, file)]
+    if found.container == "npz" and found.cube:
+        said.append(f"raw: {ENGINES['raw'].title}")
+    return said
+
+
+def _fits(found: Contents, engine: Engine, file: File) -> bool:
+    """Whether a file has the container, the pixel format, the shape and the packing of a preset's."""
+    if found.container != CONTAINERS.get(file.suffix) or found.format.split(" ")[0] != file.stored:
+        return False
+    if file.suffix == ".ktx2" and (file.zstd is not None) != (found.facts.get("supercompression") == "Zstandard"):
+        return False
+    many = len(found.levels) > 1
+    if file.holds == "dfg":
+        return found.kind in ("table", "image") and found.levels[0].texels.shape[:2] == (engine.dfg.size,) * 2
+    if file.holds in ("specular", "sheen"):
+        chain = found.cube and many and (found.levels[-1].size == 1 or not engine.whole)
+        # Filament's loader wants its harmonics in the file.
+        return chain and ("sh" in found.keys or engine.sh != "filament")
+    return found.cube and not many and file.holds in ("skybox", "irradiance")

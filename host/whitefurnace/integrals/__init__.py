@@ -1,0 +1,1 @@
+"""Integrates BRDFs over angles on grids of parameters."""

@@ -1,0 +1,578 @@
+"""Plan -> numbers: runs an integral of the catalogue over a grid of parameters, with its error estimate."""
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.catalogue import Integral, Model, integral, model
+from whitefurnace.catalogue.registry import CLOSED
+from whitefurnace.catalogue.rule import AVERAGE_RULES, LADDERS, Rule, gauss
+from whitefurnace.errors import CheckError, UnsupportedError, UsageError, nearest
+from whitefurnace.opencl import source
+from whitefurnace.opencl.derived import Areas, numbers_of
+from whitefurnace.opencl.device import Device, choose_device
+from whitefurnace.opencl.launch import CELLS_A_LAUNCH, over_nodes
+from whitefurnace.prefiltering.recipe import Chosen, Spec, chosen, is_number
+
+DEFAULT_TOLERANCE = {32: 1e-6, 64: 1e-12}
+BACKFACING = ("clamp", "absolute")
+
+# What float32 leaves however fine the rule: a relative part of the value, measured in tests/test_integrate.py.
+ROUNDING = {32: 1e-6, 64: 2e-14}
+
+BLOCK = 64
+"""Neighbouring cells that climb the ladder together. One cell alone could meet two rules that err alike."""
+
+LUCK = 5
+"""What a rule is taken to gain on the one before at most; fewer cells than a block that agree at once are taken to be
+lucky too. Without both, one lone cell in ten states an error too small in float64, by up to 30 times; whole blocks pay
+next to nothing for it."""
+
+CLOSED_FROM = (1 / 512, 1e-8)
+"""The least n·v and tolerance of kernels with closed forms: nearer to grazing or finer the general ones are faster."""
+
+UNFINISHED = 3
+"""Times its last change that the end of the ladder may be off where it did not converge: an error of first order in the
+nodes, as kinks leave it, falls by 1.4 a rule, and 1/1.4 + 1/1.4² + … is 2.5."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """The result of `integrate`.
+
+    `values` has the broadcast shape of the parameters, with a trailing axis for a vector integral; `error` is
+    the estimated absolute error, the largest over all cells; `rule` names the finest rule that was used and
+    `evaluations` counts its integrand evaluations, all cells together; `seconds` is the wall time; `notices` say
+    what was done that was not asked for, such as cells taken to float64.
+    """
+
+    values: np.ndarray
+    error: float
+    evaluations: int
+    seconds: float
+    rule: str
+    notices: tuple[str, ...] = field(default=())
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return np.array(self.values, dtype=dtype) if dtype or copy else self.values
+
+
+def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
+              fresnel: Spec = "one", diffuse: Spec | None = None, brdf: Spec | None = None,
+              precision: int = 32, tolerance: float | None = None, backfacing: str | None = None,
+              device: Device | str | None = None, out: np.ndarray | None = None, progress: Progress | None = None,
+              **parameters: Any) -> Integrated:
+    """Integrates `name` of the catalogue over all broadcast `parameters`.
+
+    name: normalization, projected_area, weak_furnace, albedo, albedo_average or dfg.
+    ndf, masking, fresnel, diffuse: names (`ggx`, `ggx:alpha=.3`, `schlick:gold`), catalogue entries, or for an NDF the
+        path of a `.clh` file. With a diffuse model, albedos are those of the sum; without an NDF, of it alone.
+    brdf: the path of a `.clh` file with a whole BRDF, for albedo and albedo_average, which then have RGB.
+    parameters: `NoV` (cosine in [0, 1]; `phi`, its azimuth in radians, for anisotropic models) where the integral has
+        a view, and the models' own (`alpha`, `f0`): an unqualified name sets it in every slot that has it,
+        `ndf_alpha` in one. They broadcast like numpy arrays; a preset or value with RGB adds a last axis of 3.
+    precision: 32 or 64. tolerance: absolute, default 1e-6 or 1e-12; two rules are compared, and the finer
+        one's values kept where they agree within it (or at the end of the ladder, with the error stated). Cells that
+        float32 cannot do are done in float64, with a notice.
+    backfacing: what to do with views behind the surface, NoV < 0: "clamp" to 0 or "absolute"; refused by default.
+    out: an array for the values, such as a memory map: a grid of any size then needs little memory of its own.
+    progress: called with the share done after each part of 65536 cells.
+
+    Raises UsageError for unknown names and values outside their domain, UnsupportedError for a combination
+    that no rule serves, DeviceError where no device works.
+    """
+    start = time.perf_counter()
+    if precision not in (32, 64):
+        raise UsageError(f"precision {precision} is not one of 32, 64")
+    entry = integral(name)
+    _refuse_lit(entry)
+    if tolerance is None:
+        tolerance = DEFAULT_TOLERANCE[precision]
+    if not is_number(tolerance) or not 0 < tolerance < 1:
+        raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
+    slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
+    grid = grid_of(entry, slots, dict(parameters), backfacing)
+    on = device if isinstance(device, Device) else choose_device(device)
+    if precision == 64 and not on.fp64:
+        raise UnsupportedError(f"{on.identity()['name']} has no float64")
+    parts = parts_of(on, entry, slots, precision)
+    components = parts[0].components
+    shape = grid.shape if components == 1 else (*grid.shape, components)
+    values = room_for(shape, precision, out)
+    flat = values.reshape(grid.size, components)
+    tally = Tally()
+    for begin in range(0, grid.size, CELLS_A_LAUNCH):
+        end = min(begin + CELLS_A_LAUNCH, grid.size)
+        total = sum(_average(part, grid, begin, end, tolerance, tally) if entry.name == "albedo_average" else
+                    _at_grazing(part, grid.rows(part, begin, end), tolerance, tally) for part in parts)
+        flat[begin:end] = np.asarray(total).T
+        if progress:
+            progress(end / grid.size)
+    error = tally.error * len(parts)
+    return Integrated(values, error, tally.evaluations, time.perf_counter() - start,
+                      tally.rule.name if tally.rule else "",
+                      (*tally.notices(), *missed(error, tolerance, precision), *_of_files(parts, flat)))
+
+
+def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
+    """A notice where the tolerance is missed by more than the rounding of a value of 1 and as much again."""
+    if not error <= 2 * max(tolerance, ROUNDING[precision]):
+        yield f"the error of {error:.2g} is over the tolerance of {tolerance:g}: the finest rule did not reach it"
+
+
+def _of_files(parts: Sequence[Part], flat: np.ndarray) -> Iterator[str]:
+    """What a user wants to hear of a model from a file: the norm that was divided out, or the range of its albedo."""
+    for part in parts:
+        for entry in part.slots.values():
+            low, high = part.norms
+            if entry.text is not None and entry.slot == "ndf":
+                some = f"{low:.4g}" if high - low <= 1e-4 * high else f"{low:.4g} to {high:.4g}"
+                yield f"{entry.path}: ∫ D(m)(n·m) dω = {some}" + (
+                    "" if part.entry.name == "normalization" else ", divided out")
+            elif entry.text is not None:
+                yield f"{entry.path}: albedo from {flat.min():.4g} to {flat.max():.4g}"
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What `integrate` would do with the same arguments: the models by slot, the shape of `values` and the digests
+    of the kernels. `precision`, `tolerance`, `device`, `out` and `progress` are no part of it."""
+
+    entry: Integral
+    slots: Mapping[str, Chosen]
+    shape: tuple[int, ...]
+    digests: tuple[str, ...]
+
+
+def demand(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
+           diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
+           **parameters: Any) -> Demand:
+    """The arguments of `integrate` checked, without a device. Raises what `integrate` raises of them."""
+    entry = integral(name)
+    _refuse_lit(entry)
+    slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
+    shape = grid_of(entry, slots, dict(parameters), backfacing).shape
+    digests = [_program(entry, some, 0).digest for some in summands_of(slots)]
+    digests += [source.closed(own, some).digest for some in summands_of(slots) if (own := own_kernel_of(entry, some))]
+    if "ndf" in slots and slots["ndf"].model.isotropic:
+        digests.append(source.area(slots["ndf"].model).digest)  # of the table, should it be needed
+    components = 3 if "brdf" in slots else entry.components
+    return Demand(entry, slots, shape if components == 1 else (*shape, components), tuple(digests))
+
+
+def room_for(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.ndarray:
+    """The array for the values: `out`, or a new one."""
+    if out is None:
+        return np.empty(shape, np.dtype(f"f{precision // 8}"))
+    if out.shape != shape or not out.flags.c_contiguous or out.dtype.kind != "f":
+        raise UsageError(f"out is {out.dtype} of shape {out.shape}; needed is a contiguous array of floats, {shape}")
+    return out
+
+
+# ---------------------------------------------------------------------------------------------- what is asked
+
+
+def _refuse_lit(entry: Integral) -> None:
+    if entry.name == "radiance":
+        raise UsageError("integral radiance needs a light or an environment: whitefurnace.integrate takes them")
+
+
+def slots_of(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
+           diffuse: Spec | None, brdf: Spec | None) -> dict[str, Chosen]:
+    """The slots an integral needs, filled; a slot it does not need is not compiled in."""
+    albedo = entry.name in ("albedo", "albedo_average", "radiance")
+    if not albedo and (diffuse is not None or brdf is not None):
+        raise UnsupportedError(f"integral {entry.name} is of an NDF; a diffuse model or a BRDF has albedo, "
+                               "albedo_average and radiance")
+    if brdf is not None:
+        if ndf is not None or diffuse is not None:
+            raise UsageError("a brdf is whole: give it without an ndf and a diffuse model")
+        return {"brdf": chosen("brdf", brdf)}
+    slots: dict[str, Chosen] = {}
+    if ndf is not None:
+        asked: dict[str, Spec] = {"ndf": ndf, "masking": masking, "fresnel": fresnel}
+        wanted = {need.split("_")[0].lower() for need in entry.needs}
+        slots = {slot: chosen(slot, spec) for slot, spec in asked.items() if slot in wanted}
+        provided = {f for choice in slots.values() for f in choice.model.provides}
+        missing = [f for f in entry.needs if f not in provided and f.split("_")[0].lower() in slots]
+        if missing:
+            owners = [(slots[f.split("_")[0].lower()].model, f.split("_", 1)[1]) for f in missing]
+            raise UnsupportedError(f"integral {entry.name}: " + ", ".join(
+                f"{owner.slot} {owner.name} has no {what}" for owner, what in owners))
+    elif diffuse is None:
+        raise UsageError(f"integral {entry.name} needs an ndf{', a diffuse model or a brdf' if albedo else ''}")
+    if diffuse is not None:
+        slots["diffuse"] = chosen("diffuse", diffuse)
+    return slots
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Broadcast columns by (slot, parameter) or name, read in parts: nothing of the grid's size is made."""
+
+    shape: tuple[int, ...]
+    columns: Mapping[str, np.ndarray]
+    rgb: bool = False  # the last axis is that of the channels
+
+    @property
+    def size(self) -> int:
+        return int(np.prod(self.shape, dtype=np.int64))
+
+    def part(self, name: str, begin: int, end: int) -> np.ndarray:
+        """Cells [begin, end) of a column, float64."""
+        column = self.columns[name]
+        return np.full(end - begin, float(column)) if column.ndim == 0 else np.asarray(
+            np.broadcast_to(column, self.shape).flat[begin:end], np.float64)
+
+    def rows(self, part: Part, begin: int, end: int) -> np.ndarray:
+        """The parameter rows of one part of the BRDF, view first: (rows, end - begin)."""
+        names = [*part.view, *(f"{slot}_{p.name}" for slot, m in part.slots.items() for p in m.parameters)]
+        return np.stack([self.part(name, begin, end) for name in names])
+
+
+def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], backfacing: str | None) -> Grid:
+    """Every number the kernels need, checked against its domain, and the broadcast shape."""
+    columns: dict[str, Any] = {}
+    rgb: set[str] = set()
+    isotropic = (all(choice.model.isotropic for choice in slots.values()) and "brdf" not in slots
+                 and entry.name != "radiance")
+    columns["NoV"] = np.ones(())
+    columns["phi"] = np.zeros(())
+    if entry.view:
+        if "NoV" not in given:
+            raise UsageError(f"integral {entry.name} needs NoV, the cosine of the view angle")
+        columns["NoV"] = _view(given.pop("NoV"), backfacing)
+        if not isotropic and "phi" in given:
+            columns["phi"] = _number("phi", given.pop("phi"))
+    names = {p.name for choice in slots.values() for p in choice.model.parameters}
+    used: set[str] = set()
+    for slot, choice in slots.items():
+        for p in choice.model.parameters:
+            qualified, where = f"{slot}_{p.name}", f"{slot} {choice.model.name}"
+            key = qualified if qualified in given else p.name
+            value: Any
+            if key in given:
+                value = given[key]
+                used.add(key)
+            elif p.name in choice.given:
+                value = choice.given[p.name]
+                if isinstance(value, tuple):
+                    rgb.add(qualified)
+            elif p.default is not None:
+                value = p.default
+            else:
+                raise UsageError(f"{where} needs {p.name}, {p.about}")
+            columns[qualified] = p.check(value, where)
+    unknown = sorted(set(given) - used)
+    if unknown:
+        known = ["NoV", *([] if isotropic else ["phi"]), *sorted(names)] if entry.view else sorted(names)
+        raise UsageError(f"integral {entry.name} has no parameter {unknown[0]!r}{nearest(unknown[0], known)}")
+    if rgb:
+        columns = {k: v if k in rgb else np.asarray(v)[..., None] for k, v in columns.items()}
+    try:
+        shape = np.broadcast_shapes(*(np.shape(v) for v in columns.values()))
+    except ValueError:
+        raise UsageError("parameters do not broadcast: shapes "
+                         + ", ".join(f"{k} {np.shape(v)}" for k, v in columns.items() if np.ndim(v))) from None
+    if 0 in shape:
+        raise UsageError("parameters hold no cell: an array is empty")
+    return Grid(shape, columns, bool(rgb))
+
+
+def _number(name: str, given: Any) -> np.ndarray:
+    try:
+        array = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        raise UsageError(f"{name} must be a number, not {given!r}") from None
+    if not np.isfinite(array).all():
+        raise UsageError(f"{name} must be finite")
+    return array
+
+
+def _view(given: Any, backfacing: str | None) -> np.ndarray:
+    """n·v in [0, 1], views from behind dealt with as asked."""
+    NoV = _number("NoV", given)
+    if backfacing is not None and backfacing not in BACKFACING:
+        raise UsageError(f"unknown backfacing {backfacing!r}{nearest(backfacing, BACKFACING)}")
+    if backfacing == "clamp":
+        NoV = np.where((NoV < 0) & (NoV >= -1), 0.0, NoV)
+    elif backfacing == "absolute":
+        NoV = np.abs(NoV)
+    bad = ~((NoV >= 0) & (NoV <= 1))
+    if bad.any():
+        behind = (NoV < 0).any() and backfacing is None
+        raise UsageError(f"NoV = {NoV[bad].flat[0]:g} is outside [0, 1] (cosine of the view angle)"
+                         + ("; views from behind want backfacing = clamp or absolute" if behind else ""))
+    return NoV
+
+
+# ---------------------------------------------------------------------------------------------- how it is done
+
+
+@dataclass
+class Part:
+    """One summand of the BRDF on a device: the specular one, the diffuse one or a user's whole one."""
+
+    device: Device
+    entry: Integral
+    slots: dict[str, Model]
+    precision: int
+    closed: str | None = None  # the file of a kernel of its own
+    areas: dict[int, Areas] = field(default_factory=dict)
+    norms: tuple[float, float] = (np.inf, 0.0)
+
+    @property
+    def kind(self) -> str:
+        if self.closed:
+            return "light-angles"
+        if "ndf" in self.slots:
+            if self.entry.support == "ALL":
+                return "polar" if self.slots["ndf"].isotropic else "stretched"
+            return "gauss" if self.slots["ndf"].isotropic else "stretched"
+        return "hemisphere" if "diffuse" in self.slots else "half-vectors"
+
+    @property
+    def view(self) -> tuple[str, ...]:
+        return ("NoV",) if self.kind in ("gauss", "polar", "hemisphere", "light-angles") else ("NoV", "phi")
+
+    @property
+    def components(self) -> int:
+        return 3 if self.kind == "half-vectors" else self.entry.components
+
+    @property
+    def tabulated(self) -> bool:
+        """Whether the masking reads Smith's area from a table."""
+        needs = {f for m in self.slots.values() for f in m.needs}
+        return "NDF_AREA" in needs and "NDF_AREA" not in self.slots["ndf"].provides
+
+    def cells(self, rows: np.ndarray, precision: int, tolerance: float = 0.0) -> tuple[np.ndarray, int, float]:
+        """Rows of view and parameters -> rows as kernels read them, the length of the area's table, its error."""
+        count = len(self.view)
+        read, out, ndf = count, [rows[:count]], None
+        for entry in self.slots.values():
+            numbers = numbers_of(self.device, entry, rows[read:read + len(entry.parameters)])
+            if entry.slot == "ndf" and entry.text is not None:
+                at = entry.arguments.index("per_norm")
+                self.norms = (min(self.norms[0], 1 / numbers[at].max()), max(self.norms[1], 1 / numbers[at].min()))
+                if self.entry.name == "normalization":
+                    numbers[at] = 1  # the raw norm is what is asked
+            ndf = numbers if entry.slot == "ndf" else ndf
+            out.append(numbers)
+            read += len(entry.parameters)
+        terms, error = 0, 0.0
+        if self.tabulated:
+            assert ndf is not None
+            if precision not in self.areas:
+                self.areas[precision] = Areas(self.device, self.slots["ndf"], precision)
+            table = self.areas[precision].table(ndf, tolerance)
+            out.append(table.rows)
+            terms, error = table.length, table.error
+        return np.concatenate(out), terms, error
+
+    @property
+    def ladder(self) -> tuple[Rule, ...]:
+        return LADDERS[self.kind]
+
+    def lanes(self, cells: np.ndarray) -> int:
+        """How many integrals the kernel sums for these cells."""
+        return cells.shape[1]
+
+    def text(self, terms: int) -> str:
+        return (source.closed(self.closed, self.slots) if self.closed else
+                _program(self.entry, self.slots, terms)).text
+
+    def sum(self, cells: np.ndarray, terms: int, rule: Rule, precision: int) -> np.ndarray:
+        return over_nodes(self.device, self.text(terms), "integrate", cells, self.components, precision, rule)
+
+
+def _program(entry: Integral, slots: Mapping[str, Model], terms: int) -> source.Source:
+    """The kernel text of one summand of the BRDF."""
+    if "ndf" in slots:
+        return source.integration(integral("albedo") if entry.name == "albedo_average" else entry, slots, terms)
+    return source.hemisphere(next(iter(slots.values())))
+
+
+def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
+    """The kernel that an integral has of its own for these models, if it has one."""
+    if "ndf" not in slots or any(m.text is not None for m in slots.values()):
+        return None
+    names = [m.name for m in slots.values()]
+    return CLOSED.get((entry.name, names[0], names[1])) if len(names) == 2 else None
+
+
+def summands_of(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
+    """The models of each summand of the BRDF: the specular one, the diffuse one or a user's whole one."""
+    specular = {slot: c.model for slot, c in slots.items() if slot in ("ndf", "masking", "fresnel")}
+    return [some for some in (specular, *({slot: slots[slot].model} for slot in ("diffuse", "brdf") if slot in slots))
+            if some]
+
+
+def parts_of(device: Device, entry: Integral, slots: Mapping[str, Chosen], precision: int) -> list[Part]:
+    return [Part(device, entry, some, precision) for some in summands_of(slots)]
+
+
+@dataclass
+class Tally:
+    """What a run has cost and how far it is from the truth."""
+
+    error: float = 0.0
+    evaluations: int = 0
+    rule: Rule | None = None
+    promoted: int = 0
+
+    def used(self, rule: Rule, cells: int) -> None:
+        self.evaluations += rule.evaluations * cells
+        if self.rule is None or rule.evaluations > self.rule.evaluations:
+            self.rule = rule
+
+    def notices(self) -> tuple[str, ...]:
+        return (f"{self.promoted} cells were done in float64: float32 did not reach the tolerance there",) \
+            if self.promoted else ()
+
+
+@np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
+def climb(part: Part, rows: np.ndarray, tolerance: float, tally: Tally, precision: int | None = None) -> np.ndarray:
+    """(components, n): climbs the ladder, every block of cells until two neighbouring rules agree on it."""
+    precision = precision or part.precision
+    ladder = part.ladder
+    cells, terms, floor = part.cells(rows, precision, tolerance)
+    n = rows.shape[1]
+    # A coarse tolerance starts low, a tight one where the tables of the rules say it can end.
+    first = 0 if tolerance >= 1e-3 else 1 if tolerance >= 1e-5 else 3 if tolerance >= 1e-8 else 5
+    values = part.sum(cells, terms, ladder[first], precision).astype(np.float64)
+    tally.used(ladder[first], part.lanes(cells))
+    active = np.arange(n)
+    change = np.empty(0)
+    slow = max(m.facts.get("slow rules", 1.0) for m in part.slots.values())
+    before = np.where(np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) < BLOCK, np.inf, 0.0)
+    for rule in ladder[first + 1:]:
+        fine = part.sum(cells[:, active], terms, rule, precision).astype(np.float64)
+        tally.used(rule, part.lanes(cells[:, active]))
+        starts = np.arange(0, active.size, BLOCK)
+        step = slow * np.maximum.reduceat(np.abs(fine - values[:, active]).max(0), starts)
+        change, before = np.maximum(step, before / LUCK), step
+        size = np.maximum.reduceat(np.abs(fine).max(0), starts)
+        values[:, active] = fine
+        rounding = ROUNDING[precision] * size
+        allowed = np.maximum(tolerance - rounding, rounding)
+        open_ = ~(change <= allowed)
+        done = float(np.max((change + rounding + floor * size)[~open_], initial=0.0))
+        tally.error = max(tally.error, done)
+        keep = np.repeat(open_, BLOCK)[:active.size]
+        change, before, rounding = change[open_], before[open_], (rounding + floor * size)[open_]
+        active = active[keep]
+        if active.size == 0:
+            break
+    if active.size and precision == 32 and part.device.fp64:
+        # Whole ladders end within float32's reach or stop at its rounding: float64 goes on from here.
+        tally.promoted += active.size
+        values[:, active] = climb(part, rows[:, active], tolerance, tally, 64)
+    elif active.size:
+        left = float(np.max(max(UNFINISHED / slow, 1) * change + rounding))
+        if not np.isfinite(left):
+            raise CheckError(f"integral {part.entry.name} is not finite for some of these parameters in "
+                             f"float{precision}{_example(part, rows, values)}")
+        tally.error = max(tally.error, left)
+    return values
+
+
+def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
+    """The first cell whose value is not finite, for a message."""
+    bad = np.flatnonzero(~np.isfinite(values).all(0))
+    if bad.size == 0:
+        return ""
+    names = [*part.view, *(p.name for m in part.slots.values() for p in m.parameters)]
+    return ": " + ", ".join(f"{name} = {value:g}" for name, value in zip(names, rows[:, bad[0]], strict=True))
+
+
+def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, tally: Tally) -> np.ndarray:
+    """`climb`, by a kernel of its own where there is one for these models, and infinity where a diffuse albedo is
+    infinite at n·v = 0, as its closed form says (Minnaert's)."""
+    own_kernel, far = own_kernel_of(part.entry, part.slots), rows[0] >= CLOSED_FROM[0]
+    if own_kernel and tolerance >= CLOSED_FROM[1] and far.any():
+        values = np.empty((part.components, rows.shape[1]))
+        values[:, far] = climb(replace(part, closed=own_kernel), rows[:, far], tolerance, tally)
+        if not far.all():
+            values[:, ~far] = climb(part, rows[:, ~far], tolerance, tally)
+        return values
+    along = np.flatnonzero(rows[0] == 0) if "diffuse" in part.slots else np.empty(0, int)
+    closed = part.slots["diffuse"].reference.get("albedo") if along.size else None
+    if closed is None:
+        return climb(part, rows, tolerance, tally)
+    own = {p.name: rows[1 + k, along] for k, p in enumerate(part.slots["diffuse"].parameters)}
+    with np.errstate(all="ignore"):
+        infinite = along[np.isinf(closed(rows[0, along], **own))]
+    rows[0, infinite] = 1  # any view that has an answer
+    values = climb(part, rows, tolerance, tally)
+    values[:, infinite] = np.inf
+    return values
+
+
+def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, tally: Tally) -> np.ndarray:
+    """(components, n): 2∫ E(μ) μ dμ with μ = x² (the grazing end wants nodes), by rules of more and more nodes."""
+    out = np.empty((part.components, end - begin))
+    for some in _slices(begin, end, 512):
+        rows = grid.rows(part, *some)
+        before: np.ndarray | None = None
+        last = np.inf  # two steps must be small: one alone can be luck
+        for count in AVERAGE_RULES:
+            x, w = gauss(count)
+            many = np.repeat(rows, count, 1)
+            many[0] = np.tile(x * x, rows.shape[1])
+            inner = Tally()
+            E = climb(part, many, tolerance / 2, inner).reshape(part.components, rows.shape[1], count)
+            tally.evaluations += inner.evaluations
+            tally.promoted += inner.promoted
+            tally.rule = inner.rule
+            value = E @ (4 * w * x**3)
+            step = np.inf if before is None else float(np.abs(value - before).max())
+            change, last = max(step, last), step if before is not None else last
+            before = value
+            if change + inner.error <= max(tolerance, 2 * inner.error):
+                break
+        tally.error = max(tally.error, change + inner.error)
+        out[:, some[0] - begin:some[1] - begin] = value
+    return out
+
+
+def _slices(begin: int, end: int, step: int) -> Iterator[tuple[int, int]]:
+    for k in range(begin, end, step):
+        yield k, min(k + step, end)
+
+
+def dfg(size: int = 128, *, ndf: Spec = "ggx", masking: Spec = "smith",
+        tolerance: float = 5e-6, precision: int = 32, device: Device | str | None = None) -> Integrated:
+    """The split-sum table: `values` (size, size, 2), float32 or float64 by `precision`, as [y, x, (scale, bias)].
+
+    x is n·v = (x + ½)/size, y perceptual roughness r = (y + ½)/size, row 0 smoothest, α = r². E(v; F0) =
+    F0·scale + bias for Schlick's Fresnel with F90 = 1. Raises as `integrate` does.
+    """
+    if not 1 <= size <= 4096:
+        raise UsageError(f"dfg size {size} is outside [1, 4096]")
+    axis = (np.arange(size) + 0.5) / size
+    choice = chosen("ndf", ndf)
+    rows: dict[str, Any] = rows_of_roughness(choice, axis[:, None])
+    return integrate("dfg", ndf=choice, masking=masking, tolerance=tolerance, precision=precision,
+                     device=device, NoV=np.broadcast_to(axis, (size, size)), **rows)
+
+
+def rows_of_roughness(choice: Chosen, r: np.ndarray) -> dict[str, np.ndarray]:
+    """The parameters of a model that follow perceptual roughness, at roughnesses of any shape; those given with it
+    are held and not among them."""
+    entry = choice.model
+    if entry.from_roughness is None:
+        raise UnsupportedError(f"{entry.slot} {entry.name} has no parameter that follows roughness")
+    sets = [entry.from_roughness(float(x)) for x in r.ravel()]
+    # A table's first row may fall below a domain by half a texel of roughness.
+    ends = {p.name: (p.low, p.high) for p in entry.parameters}
+    return {f"{entry.slot}_{name}": np.clip(np.array([s[name] for s in sets]).reshape(r.shape), *ends[name])
+            for name in sets[0] if name not in choice.given}
+
+
+__all__ = ["Integrated", "dfg", "integrate", "model"]

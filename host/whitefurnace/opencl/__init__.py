@@ -1,0 +1,1 @@
+"""Devices, assembled kernel text and launches: the only door to pyopencl."""

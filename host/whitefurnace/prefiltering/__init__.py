@@ -1,0 +1,1 @@
+"""Integrates an environment against a lobe for every texel of a chain of cubemaps."""

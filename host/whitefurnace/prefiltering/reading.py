@@ -1,0 +1,379 @@
+"""What engines show of a chain: the error of reading it between texels, between levels and from a stored format.
+
+The levels of a bake are exact to their tolerance; what is seen of them is not. For a roughness r an engine reads at
+lod(r), bilinearly in two cube levels and linearly between them. `as_read` holds that against the exact lobe of r in
+that very direction, and says which part of the way costs what.
+"""
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.errors import UnsupportedError, UsageError, nearest
+from whitefurnace.files import pack, unpack
+from whitefurnace.opencl.device import Device
+from whitefurnace.prefiltering import plan as planning
+from whitefurnace.prefiltering.certificate import texel_errors
+from whitefurnace.prefiltering.convolution import Convolver
+from whitefurnace.prefiltering.level_fit import Mixture, read_mixtures
+from whitefurnace.prefiltering.lobes import Lobe, mixture_lobe, ndf_lobe
+from whitefurnace.prefiltering.recipe import LEVELS_RANGE, Chain
+from whitefurnace.sphere.environments import Environment, cube_solid_angles
+from whitefurnace.sphere.grids import Shape, cube_directions, face_coordinates, radiance_at
+
+DIRECTIONS = 256
+"""Random directions, the same for every environment. From one set of them to another the mean over r of a studio's
+error varies by 2 % (standard deviation of five), and the ratio of `--fit read` to own lobes by 1 %."""
+
+SCORED = 24
+SMOOTHEST = 1 / 24
+"""Reads are scored at the midpoints of SCORED equal parts of r from SMOOTHEST to 1. Below, a lobe is narrower than a
+texel of a 1K image and what is seen is the image; Filament clamps at .045."""
+
+REDUCED, COARSEST = 0.35, 128
+"""A lobe of α is integrated over texels (halved by exact means where the image has finer ones) of at most this × α, in
+no fewer rows than that: on a studio they leave 2.4e-3 RMS at most, far below the error of any read."""
+
+TOLERANCE = 4e-2
+"""Of the quadrature where the image's own texels are coarser than that: r < .1, where reads err ten times more."""
+
+STEP = 0.1
+"""In log r, of the nodes at which lobes are integrated; between them they are interpolated, within 3e-4 RMS."""
+
+PARTS = ("between", "texels", "levels", "format", "all")
+"""What a read adds to the exact lobe: `between` levels that are exact everywhere, linearly in lod; `texels`, bilinearly
+between texels; `levels`, the bound on the 99th percentile of texel errors that each level states, of those that are
+read; `format`, what is stored of them; and `all` of it together."""
+
+
+# ------------------------------------------------------------------------------------------------- formats
+
+
+FORMATS: Mapping[str, str] = {"float32": "rgba32f", "float16": "rgba16f", "r11g11b10": "b10g11r11", "rgb9e5": "rgb9e5"}
+"""Formats that reads are measured through, and the pixel format of files that each is."""
+
+
+def stored(values: np.ndarray, format: str) -> np.ndarray:
+    """What radiance (…, 3) reads back as from a format of FORMATS, float64. Raises UsageError with the nearest name."""
+    if format not in FORMATS:
+        raise UsageError(f"unknown format {format!r}{nearest(format, FORMATS)}")
+    values = np.asarray(values, np.float64)
+    form = FORMATS[format]
+    return unpack(form, pack(form, values).data, values.shape[:-1])[..., :3].astype(np.float64)
+
+
+# ------------------------------------------------------------------------------------------------- reads
+
+
+def taps(size: int, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices (4, m) and weights (4, m) of a seamless bilinear read of a cube of `size` in directions (3, m).
+
+    Beyond an edge stands the texel of the next face that meets it there; the one that is missing at a corner is the
+    mean of the other three [OpenGL 4.6, 8.13].
+    """
+    face, s, t = face_coordinates(d)
+    x, y = (s + 1) / 2 * size - 0.5, (t + 1) / 2 * size - 0.5
+    j, i = np.floor(x).astype(int), np.floor(y).astype(int)
+    u, v = x - j, y - i
+    index = np.empty((4, d.shape[1]), int)
+    weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])
+    missing = np.zeros((4, d.shape[1]), bool)
+    for k in range(4):
+        column, row = j + k % 2, i + k // 2
+        beyond_x, beyond_y = (column < 0) | (column >= size), (row < 0) | (row >= size)
+        missing[k] = beyond_x & beyond_y
+        # A hair over the edge: where that lies on the next face is the texel that meets it.
+        over = 1 + 1e-9
+        a = np.where(beyond_x, np.sign(column + 0.5) * over, (2 * column + 1) / size - 1)
+        b = np.where(beyond_y, np.sign(row + 0.5) * over, (2 * row + 1) / size - 1)
+        there, a, b = face_coordinates(cube_directions(face, a, b))
+        column = np.clip(np.floor((a + 1) / 2 * size).astype(int), 0, size - 1)
+        row = np.clip(np.floor((b + 1) / 2 * size).astype(int), 0, size - 1)
+        index[k] = (there * size + row) * size + column
+    lost = (weights * missing).sum(0)
+    weights = np.where(missing, 0.0, weights + lost / 3)
+    return index, weights
+
+
+def bilinear(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(m, 3): a cube level (6, s, s, 3) read in directions (3, m)."""
+    index, weights = taps(texels.shape[1], d)
+    return np.einsum("km,kmc->mc", weights, texels.reshape(-1, 3)[index].astype(np.float64))
+
+
+def hats(roughness: np.ndarray, recipe: Chain) -> np.ndarray:
+    """(r, levels): the weight of each level of a chain in a read at roughness r, linear in lod between two."""
+    lod = np.array([recipe.lod(float(r)) for r in roughness])
+    return np.maximum(1 - np.abs(lod[:, None] - np.arange(len(recipe.levels))), 0)
+
+
+# ------------------------------------------------------------------------------------------------- references
+
+
+def halved(env: Environment) -> Environment | None:
+    """The environment over texels twice as large, each the exact mean of four; None where a size is odd."""
+    rows, columns = env.texels.shape[-3:-1]
+    if rows % 2 or columns % 2:
+        return None
+    if env.kind == "latlong":
+        # The solid angle of a row is a product of sines (environments.latlong_solid_angles).
+        weights = np.sin((np.arange(rows) + 0.5) * math.pi / rows)[:, None]
+    else:
+        weights = cube_solid_angles(rows)
+    weights = np.broadcast_to(weights, (rows, columns)).astype(np.float32)
+    tiles = (*env.texels.shape[:-3], rows // 2, 2, columns // 2, 2)
+    lit = (env.texels * weights[..., None]).reshape(*tiles, 3).sum((-4, -2), dtype=np.float64)
+    total = weights.reshape(tiles[-4:]).sum((-3, -1), dtype=np.float64)
+    return replace(env, texels=np.ascontiguousarray(lit / total[..., None], np.float32), coverage=None)
+
+
+def single(roughness: float) -> Mixture:
+    """One lobe as a mixture."""
+    return ((1.0, roughness),)
+
+
+class Exact:
+    """Exact values of a chain's lobes in any direction, each over texels as large as it allows."""
+
+    def __init__(self, device: Device, env: Environment, recipe: Chain) -> None:
+        self.device, self.env, self.recipe = device, env, recipe
+        self.mean = float(np.mean(env.statistics["mean"]))
+        self._sources: list[tuple[float, Environment]] = []
+        self._convolvers: dict[tuple[int, int], Convolver] = {}
+        reduced: Environment | None = env
+        while reduced is not None:
+            rows = reduced.texels.shape[-3]
+            self._sources.append((math.pi / rows if env.kind == "latlong" else math.pi / 2 / rows, reduced))
+            reduced = halved(reduced) if rows >= 2 * (COARSEST if env.kind == "latlong" else COARSEST // 2) else None
+        self._lobes: dict[Mixture, Lobe] = {}
+
+    def _lobe(self, mixture: Mixture) -> Lobe:
+        if mixture not in self._lobes:
+            choice, parameters = self.recipe.ndf, self.recipe.parameters
+            roughness = mixture[0][1]
+            self._lobes[mixture] = (ndf_lobe(self.device, choice, roughness, parameters(roughness))
+                                    if mixture == single(roughness) else
+                                    mixture_lobe(self.device, choice, mixture, parameters))
+        return self._lobes[mixture]
+
+    def convolver(self, k: int, precision: int = 32) -> Convolver:
+        """That of the k-th source, 0 the environment itself."""
+        if (k, precision) not in self._convolvers:
+            self._convolvers[k, precision] = Convolver(self.device, self._sources[k][1], precision=precision)
+        return self._convolvers[k, precision]
+
+    def lobes(self, wanted: Sequence[tuple[Mixture, np.ndarray]]) -> list[np.ndarray]:
+        """For each (mixture, directions (3, m)): the exact values, (m, 3) float64; that of roughness 0 is the radiance.
+
+        Raises UnsupportedError for a lobe that underflows.
+        """
+        values: list[np.ndarray] = [np.empty(0)] * len(wanted)
+        groups: dict[tuple[int, int], list[int]] = {}
+        for job, (mixture, d) in enumerate(wanted):
+            if mixture == single(0.0):
+                values[job] = self.radiance(d)
+                continue
+            alpha = self._lobe(mixture).alpha
+            fit = [k for k, (texel, _) in enumerate(self._sources) if texel <= REDUCED * alpha]
+            k = fit[-1] if fit else 0
+            texel = self._sources[k][0]
+            cuts = 1
+            while not fit and planning.cuts_error(texel, alpha, cuts) > TOLERANCE and cuts < planning.MOST_CUTS:
+                cuts = 2 * cuts
+            groups.setdefault((k, cuts), []).append(job)
+        for (k, cuts), jobs in sorted(groups.items()):
+            for precision in (32, 64):
+                convolver = self.convolver(k, precision)
+                with np.errstate(invalid="ignore"):
+                    found = convolver.exact([(self._lobe(wanted[job][0]), wanted[job][1]) for job in jobs], cuts,
+                                            TOLERANCE)
+                for job, value in zip(jobs, found, strict=True):
+                    values[job] = value / convolver.scale
+                # Charlie's lobe, all of it in the last degrees above the horizon, is below float32 where it is thin.
+                jobs = [job for job in jobs if not np.isfinite(values[job]).all()]
+                if not jobs:
+                    break
+            else:
+                lobe = self._lobe(wanted[jobs[0]][0]).name
+                raise UnsupportedError(f"ndf {self.recipe.ndf.model.name} at {lobe} has no lobe that "
+                                       f"float{convolver.precision} can integrate")
+        return values
+
+    def radiance(self, d: np.ndarray) -> np.ndarray:
+        """(m, 3): the texel of the environment in each direction, its rotation included."""
+        return radiance_at(self.env, d)
+
+    def means(self, size: int, index: np.ndarray) -> np.ndarray:
+        """(m, 3): the exact means over texels of a cube of `size`, by flat index: what level 0 stores."""
+        convolver = self.convolver(0)
+        return convolver.exact_means(Shape(False, size), index) / convolver.scale
+
+
+class Interpolated:
+    """Exact values in fixed directions at any roughness of a range: by cubic interpolation of their logarithm in
+    log r, since they are positive, span decades and are smooth in r."""
+
+    def __init__(self, exact: Exact, d: np.ndarray, smoothest: float) -> None:
+        self.exact, self.d = exact, d
+        count = max(math.ceil(-math.log(smoothest) / STEP) + 1, 4)
+        self.low = math.log(smoothest)
+        self.step = -self.low / (count - 1)
+        nodes = [min(math.exp(self.low + k * self.step), 1.0) for k in range(count)]
+        values = exact.lobes([(single(r), d) for r in nodes])
+        self.floor = 1e-12 * exact.mean or 1.0  # black has a logarithm too
+        self.values = np.log(np.stack(values) + self.floor)  # (nodes, m, 3)
+
+    def at(self, roughness: Sequence[float] | np.ndarray) -> np.ndarray:
+        """(r, m, 3) float64; r = 0 is the radiance of the environment."""
+        out = []
+        for r in roughness:
+            if r == 0:
+                out.append(self.exact.radiance(self.d))
+                continue
+            x = (math.log(r) - self.low) / self.step
+            first = min(max(int(x) - 1, 0), len(self.values) - 4)
+            nodes = range(4)
+            weights = [math.prod((x - first - b) / (a - b) for b in nodes if b != a) for a in nodes]
+            out.append(np.exp(np.tensordot(weights, self.values[first:first + 4], 1)) - self.floor)
+        return np.stack(out)
+
+
+# ------------------------------------------------------------------------------------------------- as read
+
+
+@dataclass(frozen=True)
+class AsRead:
+    """The error of a chain as it is read, part by part (PARTS, of which those are there that were measured).
+
+    Of directions uniform over the sphere, at every r of `roughness`: `rms` and `p95`, root mean square and 95th
+    percentile over directions of the texel error (README, "What the numbers mean": the largest over channels of
+    |x - ref| / max(ref, 1e-3 · mean)), where ref is the exact lobe of r in the direction and x - ref is what the
+    part adds. The number of a part is the mean of `rms` over r, uniform from SMOOTHEST to 1.
+    """
+
+    sizes: tuple[int, ...]
+    fit: str | None
+    format: str
+    roughness: np.ndarray
+    rms: Mapping[str, np.ndarray]
+    p95: Mapping[str, np.ndarray]
+
+    def mean(self, part: str = "all") -> float:
+        return float(self.rms[part].mean())
+
+    def data(self) -> dict[str, Any]:
+        """As manifests and JSON rows hold it."""
+        parts = {part: {"mean": float(self.rms[part].mean()), "p95": float(self.p95[part].mean())}
+                 for part in PARTS if part in self.rms}
+        whole = "all" if "all" in self.rms else "between"
+        return {"levels": len(self.sizes), "sizes": list(self.sizes), "fit": self.fit, "format": self.format,
+                "parts": parts,
+                "over_roughness": {"roughness": [round(float(r), 6) for r in self.roughness],
+                                   "rms": [float(x) for x in self.rms[whole]],
+                                   "p95": [float(x) for x in self.p95[whole]]}}
+
+
+def scored() -> np.ndarray:
+    """(SCORED,) roughnesses at which reads are scored."""
+    return SMOOTHEST + (1 - SMOOTHEST) * (np.arange(SCORED) + 0.5) / SCORED
+
+
+def random_directions(count: int = DIRECTIONS, seed: int = 0) -> np.ndarray:
+    """(3, count), uniform over the sphere."""
+    d = np.random.default_rng(seed).normal(size=(3, count))
+    return d / np.sqrt((d * d).sum(0))
+
+
+class Reader:
+    """Measures chains (`recipes`, of one NDF) of one environment as they are read; what they share is integrated once.
+
+    directions: how many random ones of the sphere, drawn from `seed`. Raises InputError, DeviceError.
+    """
+
+    def __init__(self, device: Device, env: Environment, *recipes: Chain, directions: int = DIRECTIONS,
+                 seed: int = 0) -> None:
+        self.device = device
+        self.exact = Exact(device, env, recipes[0])
+        self.d = random_directions(directions, seed)
+        used = [r for recipe in recipes for mixture in self.mixtures(recipe) for _, r in mixture if r > 0]
+        self.at_directions = Interpolated(self.exact, self.d, min([float(scored()[0]), *used]))
+        self.reference = self.at_directions.at(scored())
+
+    def mixtures(self, recipe: Chain) -> list[Mixture]:
+        """What each level holds, as weights of lobes; the mirror is ((1, 0),)."""
+        own = [single(r) for _, r in recipe.levels]
+        if recipe.fit != "read":
+            return own
+        return [mixture or lobe for mixture, lobe in zip(read_mixtures(self.device, recipe), own, strict=True)]
+
+    def as_read(self, recipe: Chain, levels: Sequence[np.ndarray] | None = None,
+                errors: Sequence[float] | None = None, *, format: str = "float32",
+                kept: Sequence[np.ndarray] | None = None, texels: bool = True) -> AsRead:
+        """The error of a chain as it is read.
+
+        levels: its baked levels, (6, s, s, 3) each, and `errors` what they state; without them it is that of levels
+        exact in every texel. kept: what `format` made of the levels; without it one of FORMATS is applied. texels:
+        False leaves out what lies within a level, and costs next to nothing then.
+        """
+        mixtures = self.mixtures(recipe)
+        weights = hats(scored(), recipe)
+        nodes = sorted({r for mixture in mixtures for _, r in mixture})
+        values = dict(zip(nodes, self.at_directions.at(nodes), strict=True))
+        there = np.stack([sum(w * values[r] for w, r in mixture) for mixture in mixtures])  # (levels, m, 3)
+        parts = {"between": np.tensordot(weights, there, 1) - self.reference}
+        if texels:
+            tapped = [taps(size, self.d) for size, _ in recipe.levels]
+            made = (self._texels(recipe, mixtures, tapped) if levels is None else
+                    [level.reshape(-1, 3)[index].astype(np.float64)
+                     for level, (index, _) in zip(levels, tapped, strict=True)])
+            held = ([stored(part, format) for part in made] if kept is None else
+                    [level.reshape(-1, 3)[index].astype(np.float64)
+                     for level, (index, _) in zip(kept, tapped, strict=True)])
+            read, shown = (np.stack([np.einsum("km,kmc->mc", w, part)
+                                     for part, (_, w) in zip(some, tapped, strict=True)])
+                           for some in (made, held))
+            parts["texels"] = np.tensordot(weights, read - there, 1)
+            parts["format"] = np.tensordot(weights, shown - read, 1)
+            parts["all"] = np.tensordot(weights, shown, 1) - self.reference
+        off = {part: np.stack([texel_errors(ref + more, ref, self.exact.mean)
+                                  for ref, more in zip(self.reference, difference, strict=True)])
+                  for part, difference in parts.items()}
+        rms = {part: np.sqrt((e * e).mean(1)) for part, e in off.items()}
+        p95 = {part: np.quantile(e, 0.95, axis=1) for part, e in off.items()}
+        if errors is not None:
+            rms["levels"] = p95["levels"] = weights @ np.asarray(errors, np.float64)
+        return AsRead(tuple(size for size, _ in recipe.levels), recipe.fit, format, scored(), rms, p95)
+
+    def _texels(self, recipe: Chain, mixtures: Sequence[Mixture],
+                tapped: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+        """Exact values (4, m, 3) of the texels that each level is read from."""
+        wanted, places = [], []
+        for (size, roughness), mixture, (index, _) in zip(recipe.levels, mixtures, tapped, strict=True):
+            distinct, back = np.unique(index, return_inverse=True)
+            places.append((size, roughness, distinct, back.reshape(index.shape)))
+            if roughness > 0:
+                wanted.append((mixture, Shape(False, size).directions(distinct)))
+        values = iter(self.exact.lobes(wanted))
+        return [(next(values) if roughness > 0 else self.exact.means(size, distinct))[back]
+                for size, roughness, distinct, back in places]
+
+
+def alternatives(recipe: Chain) -> list[Chain]:
+    """A plan beside what could be had: own lobes and `--fit read`, with its number of levels, half as many more and
+    twice as many. More levels than the last size halves to keep that size."""
+    count = len(recipe.levels)
+    found = []
+    for n in dict.fromkeys((count, min(math.ceil(1.5 * count), LEVELS_RANGE[1]), min(2 * count, LEVELS_RANGE[1]))):
+        found += [replace(recipe, count=n, fit=fit) for fit in (None, "read")]
+    return found
+
+
+def compared(device: Device, env: Environment, recipe: Chain, *, alone: bool = False) -> list[AsRead]:
+    """`alternatives` as they are read, the levels exact; `alone`: the plan only, where an engine allows no other."""
+    choices = [recipe] if alone or recipe.only or recipe.levels[-1][1] > 1 else alternatives(recipe)
+    reader = Reader(device, env, *choices)
+    return [reader.as_read(choice, texels=len(choice.levels) == len(recipe.levels)) for choice in choices]

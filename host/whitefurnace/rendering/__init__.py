@@ -1,0 +1,1 @@
+"""Renders spheres as an engine shades them, beside the full reflectance integral."""

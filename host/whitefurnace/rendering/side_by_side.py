@@ -1,0 +1,508 @@
+"""An engine's picture of spheres beside the full reflectance integral of the same pixels, and what they differ by."""
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.baking.bake import demo
+from whitefurnace.engines.presets import Engine
+from whitefurnace.errors import FileError, InputError, UsageError
+from whitefurnace.files import read_manifest, write_exr
+from whitefurnace.integrals.radiance import radiance
+from whitefurnace.opencl.device import Device, choose_device
+from whitefurnace.prefiltering.certificate import texel_errors
+from whitefurnace.prefiltering.lighting import irradiance
+from whitefurnace.prefiltering.reading import bilinear
+from whitefurnace.prefiltering.recipe import Chosen, Spec, chosen
+from whitefurnace.rendering import shading as rendering
+from whitefurnace.rendering.shading import Lights
+from whitefurnace.rendering.truth import Points, Term, Truth, albedo, term
+from whitefurnace.scenes.material_spheres import DIELECTRIC, Laid, Swatch, laid
+from whitefurnace.sphere.environments import Environment, environment
+from whitefurnace.sphere.grids import radiance_at
+from whitefurnace.sphere.suns import without_sun
+
+TOLERANCE = 1e-2
+TOLERANCE_RANGE = (1e-4, 0.5)
+
+IRRADIANCE = 128
+"""Texels a face edge of the cube of E/π that a Lambertian is read from: bilinear reads err by 2e-5 of its range."""
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+"""Of linear Rec.709."""
+
+DARK = 1e-3
+"""Of the mean radiance: differences are over the luminance of the truth, or over this where it is less."""
+
+MOST = 0.95
+"""Part of the spheres' pixels that the scale of differences reaches over."""
+
+SUFFIXES = (".png", ".exr")
+
+MIRROR = 1 / 64
+"""Roughness below which truth is a mirror: its lobe, α = 2.4e-4, is narrower than a texel of an image of 16K."""
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Material:
+    """What all spheres are made of, each a swatch of it, in the metallic-roughness model of glTF 2.0.
+
+    The specular part has the NDF, Smith's masking and F = (1 - metalness) F_d + metalness F_m, Schlick's of the
+    swatch's insulator and of F0 = base colour where no other `dielectric` and `metal` are given. The diffuse part is
+    (1 - metalness) times what a `diffuse` model of that base colour reflects, Lambert's where none is given, times
+    1 - E_d(v), E_d the directional albedo of the specular part under F_d: it gets what the specular leaves, as in the
+    engines.
+
+    Facets scatter once. `multiscatter` gives back what is lost by that, as most engines do: the specular part times
+    1 + F0 (1/E₁ - 1), E₁ the albedo of F = 1 and F0 the Fresnel at n = v. [Turquin2019]
+    """
+
+    ndf: Spec = "ggx"
+    masking: Spec = "smith"
+    dielectric: Spec | None = None
+    metal: Spec | None = None
+    diffuse: Spec | None = None
+    multiscatter: bool = False
+
+    def terms(self, roughness: float) -> dict[str, Term]:
+        """By what they are of: "both" Schlick's, where linear in F0, or "dielectric" and "metal"."""
+        base: dict[str, Any] = {"ndf": self.ndf, "masking": self.masking, "roughness": roughness}
+        found = {}
+        if self.dielectric is None or self.metal is None:
+            found["both"] = term(**base, fresnel="schlick", fresnel_f0=np.array([DIELECTRIC, 1.0]), fresnel_f90=1.0)
+        for name, spec in (("dielectric", self.dielectric), ("metal", self.metal)):
+            if spec is not None:
+                found[name] = term(**base, fresnel=spec)
+        return found
+
+
+@dataclass(frozen=True)
+class Certified:
+    """One pixel held against the quadrature: its roughness, n·v, the variant and the error over its value."""
+
+    roughness: float
+    NoV: float
+    of: str
+    value: tuple[float, ...]
+    exact: tuple[float, ...]
+    error: float
+
+
+@dataclass(frozen=True)
+class Shown:
+    """`engine`, `truth` and `difference` (h, w, 3), linear; `difference` is engine - truth over the luminance of the
+    truth, 0 beside the spheres. `samples` a pixel and `estimates` of their error by `roughness`, that of each column or
+    each other one of a scene, and the certificate."""
+
+    engine: np.ndarray
+    truth: np.ndarray
+    difference: np.ndarray
+    samples: tuple[int, ...]
+    estimates: tuple[float, ...]
+    certificate: tuple[Certified, ...]
+    seconds: Mapping[str, float]
+    covered: np.ndarray
+    roughness: tuple[float, ...]
+
+    @property
+    def luminance(self) -> np.ndarray:
+        """(h, w): the difference of luminances."""
+        return np.asarray(self.difference @ LUMINANCE)
+
+    def within(self, share: float) -> float:
+        """The relative difference that a share of the spheres' pixels is within."""
+        return float(np.quantile(np.abs(self.luminance[self.covered]), share))
+
+    @property
+    def error(self) -> float:
+        """The worst of the certificate; NaN without one."""
+        return max((c.error for c in self.certificate), default=math.nan)
+
+
+@dataclass(frozen=True)
+class Rendered(rendering.Rendered):
+    """A picture of three panels, and what is stated of it."""
+
+    source: str = ""
+    tolerance: float = TOLERANCE
+    samples: tuple[int, ...] = ()
+    estimates: tuple[float, ...] = ()
+    certificate: tuple[Certified, ...] = ()
+    error: float = math.nan
+    median: float = math.nan
+    most: float = math.nan
+    multiscatter: bool = False
+    scale: float = 0.0
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+# ---------------------------------------------------------------------------------------------- the truth of spheres
+
+
+class Spheres:
+    """The truth of points of spheres in one environment and under further lights."""
+
+    def __init__(self, truth: Truth, material: Material, points: Points, lights: Sequence[Spec] = ()) -> None:
+        self.truth, self.material, self.points = truth, material, points
+        self.lights = tuple(chosen("light", spec) for spec in lights)
+        self._diffuse: dict[Triple, np.ndarray] = {}
+        self._diffuse_lit: dict[Triple, np.ndarray] = {}
+
+    def alike(self, roughness: float, swatches: Sequence[Swatch], tolerance: float,
+              ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
+        """Of one roughness: for each swatch (m, 3) by the environment and (m, 3) by the further lights, the samples a
+        point and the estimate of their error, and the terms."""
+        truth, points = self.truth, self.points
+        found = self.material.terms(roughness)
+        lost = self._lost(roughness)
+        made, lit, counts, estimates = {}, {}, [0], [0.0]
+        for name, one in found.items():
+            count = 0
+            if not one.smooth:
+                count, estimate = truth.samples(one, points, tolerance)
+                counts.append(count)
+                estimates.append(estimate)
+            made[name] = truth.reflected(one, points, count)
+            lit[name] = self.lit(one) if self.lights else 0 * made[name][0]
+
+        def of(what: str, F0: Any, values: Mapping[str, Any], albedo: bool = False) -> np.ndarray:
+            """(m, 3) of the dielectric or the metal."""
+            held = values[what if what in values else "both"]
+            S = held[1] if albedo else held[0] if isinstance(held, tuple) else held
+            S = np.broadcast_to(S[..., None], (*S.shape, 3)) if albedo else S
+            if what in values:
+                channel = np.arange(3) if S.shape[1] == 3 else np.zeros(3, int)
+                F0 = truth.mirror(found[what], _facing())[1][0, channel]
+                once = S[:, channel, np.arange(3)]
+            else:
+                once = S[:, 0] + (F0 - DIELECTRIC) / (1 - DIELECTRIC) * (S[:, 1] - S[:, 0])
+            return np.asarray(once * (1 + F0 * lost[:, None]))
+
+        pictures, extras = [], []
+        for swatch in swatches:
+            m, base = swatch.metalness, swatch.base_color
+            color, F0 = np.asarray(base, np.float64), np.asarray(swatch.insulator, np.float64)
+            rest = 1 - of("dielectric", F0, made, albedo=True)
+            mixed = [(1 - m) * of("dielectric", F0, values) + m * of("metal", color, values) for values in (made, lit)]
+            pictures.append(mixed[0] + (1 - m) * rest * self.diffuse(base))
+            extras.append(mixed[1] + (1 - m) * rest * self.diffuse_lit(base))
+        return pictures, extras, max(counts), max(estimates), found
+
+    def _lost(self, roughness: float) -> np.ndarray:
+        """(m,) 1/E₁ - 1, 0 where nothing is given back."""
+        if not self.material.multiscatter or roughness == 0:
+            return np.zeros(self.points.n.shape[1])
+        one = term(ndf=self.material.ndf, masking=self.material.masking, roughness=roughness)
+        return np.asarray(1 / albedo(one, self.points.NoV, self.truth.device)[:, 0] - 1)
+
+    @cached_property
+    def _lambert(self) -> np.ndarray:
+        """(m, 3) E/π of the environment."""
+        cube = irradiance(self.truth.env, size=IRRADIANCE, device=self.truth.device).values
+        return bilinear(cube, self.points.n)
+
+    def diffuse(self, base_color: Triple) -> np.ndarray:
+        """(m, 3): what the diffuse model reflects of the environment, base colour and all."""
+        truth, points = self.truth, self.points
+        if self.material.diffuse is None:
+            return np.asarray(self._lambert * np.asarray(base_color, np.float64))
+        if base_color not in self._diffuse:
+            found = self._diffuse_term(base_color)
+            count, _ = truth.samples(found, points, TOLERANCE / 4)
+            self._diffuse[base_color] = truth.reflected(found, points, count)[0][:, np.arange(3), np.arange(3)]
+        return self._diffuse[base_color]
+
+    def _diffuse_term(self, base_color: Triple) -> Term:
+        choice = chosen("diffuse", "lambert" if self.material.diffuse is None else self.material.diffuse)
+        given: dict[str, Any] = {}
+        if "albedo" not in choice.given:
+            given["diffuse_albedo"] = np.asarray(base_color, np.float64)
+        found = term(diffuse=choice, **given)
+        return Term(found.models, {name: np.broadcast_to(v, (3,)) for name, v in found.parameters.items()})
+
+    def diffuse_lit(self, base_color: Triple) -> np.ndarray:
+        """(m, 3) of the further lights."""
+        if not self.lights:
+            return np.zeros((self.points.n.shape[1], 3))
+        if base_color not in self._diffuse_lit:
+            values = self.lit(self._diffuse_term(base_color))
+            self._diffuse_lit[base_color] = values[:, np.arange(3), np.arange(3)]
+        return self._diffuse_lit[base_color]
+
+    def lit(self, found: Term) -> np.ndarray:
+        """(m, S, 3): what the further lights give under a term, in closed form or along their outlines."""
+        points, total = self.points, np.zeros((self.points.n.shape[1], found.sets, 3))
+        own = {name: np.broadcast_to(v, (found.sets,)) for name, v in found.parameters.items()}
+        models: dict[str, Any] = dict(found.models)
+        if found.smooth:
+            models, own = {"fresnel": models["fresnel"]}, {n: v for n, v in own.items() if n.startswith("fresnel_")}
+        for light in self.lights:
+            if found.smooth and "LIGHT_L" not in light.model.provides:
+                continue  # a mirror shows nothing of a light that has no size
+            for c in range(3):
+                given = {name: v[c] if isinstance(v, tuple) else v for name, v in light.given.items()}
+                placed = in_frame(light, given, points)
+                numbers: dict[str, Any] = {**own, **{f"light_{name}": v[:, None] for name, v in placed.items()}}
+                values = radiance(light=Chosen(light.model, {}), NoV=points.NoV[:, None], phi=0.0, tolerance=1e-4,
+                                  device=self.truth.device, **models, **numbers).values
+                if not any(isinstance(v, tuple) for v in light.given.values()):
+                    total += np.asarray(values, np.float64).reshape(total.shape[:2])[..., None]
+                    break
+                total[..., c] += np.asarray(values, np.float64).reshape(total.shape[:2])
+        return total
+
+
+def _facing() -> Points:
+    """One point whose normal is the view."""
+    up = np.array([[0.0], [0.0], [1.0]])
+    return Points(up, up)
+
+
+def in_frame(light: Chosen, given: Mapping[str, float], points: Points) -> dict[str, np.ndarray]:
+    """A light's parameters, (m,) each, in the frame of every point: its n is +z and v has the azimuth 0.
+
+    They are given in that of the sphere's middle, which is the frame of a surface that faces the viewer: +z towards the
+    viewer, +x to the right, lengths in radii. What is named NAME_x, NAME_y, NAME_z is a vector, a `center` a place; NoL
+    and phi_l are a direction. Raises UsageError for a parameter that is missing.
+    """
+    model, m = light.model, points.n.shape[1]
+    told = {**{p.name: p.default for p in model.parameters if p.default is not None}, **given}
+    for p in model.parameters:
+        if p.name not in told:
+            raise UsageError(f"light {model.name} needs {p.name}, {p.about}")
+    surface = points.surface()
+    x, z = surface[3:6], points.n
+    frame = np.stack([x, np.cross(z, x, axis=0), z])  # (3, 3, m)
+    placed = {name: np.full(m, float(value)) for name, value in told.items()}
+    for name in [n[:-2] for n in told if n.endswith("_x")]:
+        vector = np.array([told[f"{name}_{axis}"] for axis in "xyz"], np.float64)[:, None]
+        vector = vector - points.n if name == "center" else np.broadcast_to(vector, (3, m))
+        placed |= {f"{name}_{axis}": (row * vector).sum(0) for axis, row in zip("xyz", frame, strict=True)}
+    if "NoL" in told and "phi_l" in told:
+        c, phi = float(told["NoL"]), float(told["phi_l"])
+        s = math.sqrt((1 - c) * (1 + c))
+        to = (frame * np.array([s * math.cos(phi), s * math.sin(phi), c])[:, None]).sum(1)
+        placed |= {"NoL": np.clip(to[2], -1.0, 1.0), "phi_l": np.arctan2(to[1], to[0])}
+    return placed
+
+
+# ---------------------------------------------------------------------------------------------- pictures
+
+
+def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], device: Device) -> Environment:
+    """The environment of a bake as the bake had it: turned, exposed and without its sun as the manifest says.
+
+    Raises InputError where its digest is not the one in the manifest, and what `environment` raises.
+    """
+    told = rendering.dictionary(read_manifest(Path(manifest)))
+    recipe, source = rendering.dictionary(told.get("recipe")), rendering.dictionary(told.get("source"))
+    item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
+    turn, exposure = recipe.get("rotate"), recipe.get("exposure")
+    for name, value in (("rotate", turn), ("exposure", exposure)):
+        if not isinstance(value, (int, float)):
+            raise InputError(f"{manifest} tells no {name}: it is not the manifest of a bake")
+    found = environment(item, rotate=float(turn), exposure=float(exposure),  # type: ignore[arg-type]
+                        nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse")
+    if found.digest != source.get("sha256"):
+        raise InputError(f"{given} is not the image that {manifest} was baked from: its sha256 is {found.digest[:16]}…"
+                         f", the bake's is {str(source.get('sha256'))[:16]}…")
+    return without_sun(found, str(recipe.get("sun", "keep")))[0]
+
+
+def ndf_of(manifest: str | os.PathLike[str]) -> Spec:
+    """The NDF that a bake was filtered with. Raises UsageError for one from a file."""
+    told = rendering.dictionary(rendering.dictionary(read_manifest(Path(manifest))).get("recipe")).get("ndf", "ggx")
+    if isinstance(told, str):
+        return told
+    entry = rendering.dictionary(told)
+    if "sha256" in entry or not isinstance(entry.get("name"), str):
+        raise UsageError(f"{manifest} was filtered with an NDF from a file: give it as --ndf FILE.clh")
+    given = {k: tuple(v) if isinstance(v, list) else v for k, v in entry.items() if k != "name"}
+    return Chosen(chosen("ndf", entry["name"]).model, given)
+
+
+def panels(engine: Engine, lights: Lights, env: Environment, device: Device, material: Material, laid: Laid, *,
+           size: int = 128, background: str = "environment", tolerance: float = TOLERANCE, certify: int = 1,
+           further: Sequence[Spec] = (), progress: Callable[[str, float], None] | None = None) -> Shown:
+    """The spheres of `rendering.drawn` as the engine shows them, in truth, and their difference. What is smoother than
+    MIRROR is one in truth.
+
+    tolerance: of the 99th percentile of errors of the specular part of each roughness, over its value or 1e-3 of the
+    mean radiance. certify: pixels of each roughness that are held against the quadrature. further: lights besides the
+    environment, which are added to both pictures alike. Raises as `rendering.drawn` does.
+    """
+    begin = time.perf_counter()
+    shown = rendering.drawn(engine, lights, laid, size=size, background=background)
+    clock = {"engine": time.perf_counter() - begin}
+    index, cover, n = rendering.sphere(size)
+    points = Points(n, np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape))
+    truth = Truth(device, env)
+    spheres = Spheres(truth, material, points, further)
+    groups: dict[float, list[int]] = {}
+    for k, one in enumerate(laid.swatches):
+        groups.setdefault(one.roughness if one.roughness >= MIRROR else 0.0, []).append(k)
+    picture = np.full(shown.shape, rendering.GREY)
+    if background == "environment":
+        picture = radiance_at(env, rendering.camera(shown.shape)).reshape(shown.shape)
+    difference, covered = np.zeros(shown.shape), np.zeros(shown.shape[:2], bool)
+    mean, samples, estimates, certificate = float(np.mean(env.statistics["mean"])), [], [], []
+    clock |= {"truth": 0.0, "certificate": 0.0}
+    for j, (roughness, those) in enumerate(groups.items()):
+        begin = time.perf_counter()
+        true, extra, count, estimate, terms = spheres.alike(roughness, [laid.swatches[k] for k in those],
+                                                            tolerance)
+        samples.append(count)
+        estimates.append(estimate)
+        for k, by_sky, by_lights in zip(those, true, extra, strict=True):
+            one, (i, across) = laid.swatches[k], divmod(k, laid.columns)
+            where = np.s_[i * size:(i + 1) * size, across * size:(across + 1) * size]
+            lit = rendering.shade(engine, lights, n, points.v, one.base_color, one.metalness, one.roughness,
+                                  np.asarray(one.insulator))
+            whole = by_sky + by_lights
+            apart = (lit - by_sky) / np.maximum(whole @ LUMINANCE, max(DARK * mean, 1e-30))[:, None]
+            shown[where] += _over(np.zeros((size, size, 3)), index, cover, by_lights)
+            picture[where] = _over(picture[where], index, cover, whole)
+            difference[where] = _over(difference[where], index, (cover > 0.5).astype(float), apart)
+            covered[where] = _over(np.zeros((size, size, 1)), index, (cover > 0.5).astype(float),
+                                   np.ones((len(index), 1)))[..., 0] > 0
+        clock["truth"] += time.perf_counter() - begin
+        begin = time.perf_counter()
+        certificate += _certificate(truth, terms, points, roughness, j * certify, certify, count, mean)
+        clock["certificate"] += time.perf_counter() - begin
+        if progress:
+            progress("truth", (j + 1) / len(groups))
+    return Shown(shown, picture, difference, tuple(samples), tuple(estimates), tuple(certificate), clock, covered,
+                 tuple(groups))
+
+
+def _over(cell: np.ndarray, index: np.ndarray, cover: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """A cell (size, size, c) with values (m, c) laid over it."""
+    flat = cell.reshape(-1, cell.shape[-1]).copy()
+    flat[index] += (values - flat[index]) * cover[:, None]
+    return flat.reshape(cell.shape)
+
+
+def _certificate(truth: Truth, terms: Mapping[str, Term], points: Points, roughness: float, first: int, many: int,
+                 count: int, mean: float) -> list[Certified]:
+    """Pixels by the golden ratio over the sphere, of one variant after the other."""
+    found = []
+    variants = [(name, one, k) for name, one in terms.items() for k in range(one.sets)]
+    for number in range(first, first + many):
+        name, one, variant = variants[number % len(variants)]
+        if one.smooth:
+            continue  # both are the same texel
+        k = int((0.5 + number * (math.sqrt(5) - 1) / 2) % 1 * points.n.shape[1])
+        got = truth.reflected(one, points.some([k]), count)[0][0, variant]
+        want = truth.exact(one, variant, points, k)
+        of = f"{name} {variant + 1} of {one.sets}" if name != "both" else ("dielectric", "white metal")[variant]
+        error = float(texel_errors(got[None], want[None], mean)[0])
+        found.append(Certified(roughness, float(points.NoV[k]), of, tuple(got.tolist()), tuple(want.tolist()), error))
+    return found
+
+
+def scale_of(shown: Shown) -> float:
+    """The difference at the ends of the colours: 1, 2 or 5 times a power of ten that 95 % of the spheres are within, 1
+    at most."""
+    most = shown.within(MOST)
+    power = 10.0 ** math.floor(math.log10(max(most, 1e-6)))
+    return min(next(k * power for k in (1, 2, 5, 10) if k * power >= most * (1 - 1e-9)), 1.0)
+
+
+def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, for_: str,
+           truth: str | os.PathLike[str], size: int = 128, columns: int = 7, rows: int | None = None,
+           exposure: float = 0.0, base_color: Sequence[float] | None = None, background: str = "environment",
+           scene: str | os.PathLike[str] | None = None, tolerance: float | None = None, certify: int = 1,
+           ndf: Spec | None = None, dielectric: Spec | None = None, metal: Spec | None = None,
+           diffuse: Spec | None = None, multiscatter: bool = False, light: Sequence[Spec] = (),
+           device: Device | str | None = None, force: bool = False,
+           progress: Callable[[str, float], None] | None = None) -> Rendered:
+    """Draw the spheres of a bake for one engine, beside them the truth, and the difference: a PNG of three panels with
+    a scale, or an EXR of the layers engine, truth and difference in float32, without exposure.
+
+    truth: the image that the bake was made of. The other parameters are those of `rendering.render`, `panels` and
+    `Material`; the NDF is the bake's own by default. Raises as they do, UnsupportedError for a PNG without matplotlib.
+    """
+    output = Path(output)
+    if output.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"{output} is no name of a picture: it must end with {' or '.join(SUFFIXES)}")
+    low, high = TOLERANCE_RANGE
+    bound = TOLERANCE if tolerance is None else float(tolerance)
+    if not low <= bound <= high:
+        raise UsageError(f"tolerance {bound:g} is outside [{low:g}, {high:g}]")
+    if not 0 <= certify <= 1000:
+        raise UsageError(f"certify {certify} is outside [0, 1000]")
+    if not -rendering.EXPOSURES <= exposure <= rendering.EXPOSURES:
+        raise UsageError(f"exposure {exposure:g} is outside [{-rendering.EXPOSURES:g}, {rendering.EXPOSURES:g}]")
+    if output.exists() and not force:
+        raise FileError(f"{output} exists; --force replaces it")
+    if output.suffix.lower() == ".png":
+        from whitefurnace import plot_style as plots
+
+        plots.require()
+    engine, folder, stem = rendering.engine_in(manifest, for_)
+    lights = rendering.read_lights(engine, folder, stem)
+    for name, spec in (("dielectric", dielectric), ("metal", metal)):
+        if scene is not None and spec is not None:
+            raise UsageError(f"{name} is of the grid: the materials of a scene have their own F0")
+    spheres = laid(scene, columns, rows, base_color)
+    material = Material(ndf_of(manifest) if ndf is None else ndf, "smith", dielectric, metal, diffuse, multiscatter)
+    further = [chosen("light", spec) for spec in light]
+    on = device if isinstance(device, Device) else choose_device(device)
+    env = source_of(manifest, truth, on)
+    shown = panels(engine, lights, env, on, material, spheres, size=size, background=background, tolerance=bound,
+                   certify=certify, further=further, progress=progress)
+    scale = scale_of(shown)
+    notices = [*lights.notices, *env.notices, *spheres.notices]
+    if further:
+        notices.append("what lights besides the environment add is the same in both pictures: what differs is the "
+                       "environment's")
+    missed = [f"{r:.3g}" for r, e in zip(shown.roughness, shown.estimates, strict=True) if e > bound]
+    if missed:
+        notices.append(f"the tolerance of {bound:g} is missed at roughness {', '.join(missed)}: "
+                       f"{max(shown.estimates):.2g} after {max(shown.samples)} samples a pixel")
+    made = Rendered(output, engine.name, shown.engine.shape[1], shown.engine.shape[0], spheres.roughness,
+                    spheres.metalness, exposure, lights.read, tuple(notices), spheres.placed(), env.digest, bound,
+                    shown.samples, shown.estimates, shown.certificate, shown.error, shown.within(0.5),
+                    shown.within(MOST), multiscatter, scale, shown.seconds)
+    if output.suffix.lower() == ".exr":
+        layers = ("difference", "engine", "truth")  # the order in which readers list them
+        write_exr(output, np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
+                  channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"), attributes=_stated(made))
+    else:
+        plots.draw_beside(output, [rendering.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
+                         np.where(shown.covered, shown.luminance, np.nan), scale, engine.name, _caption(made),
+                         {key: str(value) for key, value in _stated(made).items()})
+    return made
+
+
+def _stated(made: Rendered) -> dict[str, str | float | int]:
+    """What is stored with the picture."""
+    return {"engine": made.engine, "source": made.source, "tolerance": made.tolerance, "error": made.error,
+            "certified": len(made.certificate), "samples": " ".join(map(str, made.samples)),
+            "difference_median": made.median, "difference_95": made.most, "difference_scale": made.scale,
+            "scattering": "multiple" if made.multiscatter else "single",
+            **({"materials": "; ".join(f"{one['name']} ({one['row']}, {one['column']})" for one in made.materials)}
+               if made.materials else {})}
+
+
+def _caption(made: Rendered) -> tuple[str, ...]:
+    across = f"roughness {made.roughness[0]:g} to {made.roughness[-1]:g} across" if len(made.roughness) > 1 else ""
+    down = f"metalness {made.metalness[0]:g} to {made.metalness[-1]:g} down" if len(made.metalness) > 1 else "metal"
+    if made.materials:
+        across, down = f"{len(made.materials)} materials of a scene, row by row", ""
+    scattering = f"truth: facets scatter {'again, by scale' if made.multiscatter else 'once'}"
+    held = f", within {made.error:.1e} at {len(made.certificate)} pixels of a quadrature" if made.certificate else ""
+    return (", ".join(filter(None, (across, down))),
+            f"difference: {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of "
+            "100",
+            scattering + held)

@@ -1,0 +1,1 @@
+"""Reads glTF scenes and states facts about their materials and media."""

@@ -1,0 +1,179 @@
+"""What the spheres of a picture are made of: roughness across and metalness down, or the materials of a scene."""
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from whitefurnace.errors import InputError, UsageError
+from whitefurnace.scenes.materials import Material, Scene, Spread, read_scene
+
+DIELECTRIC = 0.04
+"""F0 of what is no metal, of an index of 1.5, in every engine here."""
+
+COUNT_RANGE = (1, 64)
+"""Of columns, and of rows."""
+
+MOST = 64
+"""Materials of a scene in one picture."""
+
+EVEN = 1 / 128
+"""Two steps of 8 bits: a texture that varies by no more has one value."""
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Swatch:
+    """What one sphere is made of: base colour, metalness and perceptual roughness in [0, 1], and F0 of what is no
+    metal, a number or RGB."""
+
+    base_color: Triple
+    metalness: float
+    roughness: float
+    insulator: float | Triple = DIELECTRIC
+    name: str = ""
+
+
+@dataclass(frozen=True)
+class Laid:
+    """Spheres row by row, `columns` to a row, the last row maybe shorter. `roughness` of the columns and `metalness` of
+    the rows of a grid, empty for a scene's; and what the spheres leave out."""
+
+    swatches: tuple[Swatch, ...]
+    columns: int
+    roughness: tuple[float, ...] = ()
+    metalness: tuple[float, ...] = ()
+    notices: tuple[str, ...] = ()
+    scene: str = ""
+
+    @property
+    def rows(self) -> int:
+        return -(-len(self.swatches) // self.columns)
+
+    def placed(self) -> tuple[dict[str, object], ...]:
+        """Of a scene: each material's name, its row and column from 1, and what its sphere is made of."""
+        return tuple({"name": s.name, "row": k // self.columns + 1, "column": k % self.columns + 1,
+                      "base_color": s.base_color, "metalness": s.metalness, "roughness": s.roughness,
+                      "f0": s.insulator} for k, s in enumerate(self.swatches)) if self.scene else ()
+
+
+def steps(count: int, alone: float) -> tuple[float, ...]:
+    return tuple(float(x) for x in np.linspace(0, 1, count)) if count > 1 else (alone,)
+
+
+def in_range(what: str, value: int, limits: tuple[int, int] = COUNT_RANGE) -> None:
+    """Raises UsageError."""
+    if not limits[0] <= value <= limits[1]:
+        raise UsageError(f"{what} {value} is outside [{limits[0]}, {limits[1]}]")
+
+
+def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0, 1.0, 1.0)) -> Laid:
+    """Roughness 0 … 1 from left to right, 0 where there is one column, and metalness 0 … 1 from the top down, 1 where
+    there is one row. Raises UsageError for what is out of its range."""
+    in_range("columns", columns)
+    in_range("rows", rows)
+    color = np.asarray(base_color, np.float64)
+    if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
+        raise UsageError(f"base color {' '.join(f'{c:g}' for c in color.ravel())} is not three numbers in [0, 1]")
+    across, down = steps(columns, 0.0), steps(rows, 1.0)
+    return Laid(tuple(Swatch(_triple(color), m, r) for m in down for r in across), columns, across, down)
+
+
+def of_scene(scene: Scene, columns: int = 7) -> Laid:
+    """A sphere for each material of a scene that light falls on, in the order of the file, at most MOST of them.
+
+    Raises UsageError for columns out of range, InputError for a scene without such materials.
+    """
+    in_range("columns", columns)
+    lit = [m for m in scene.materials if not m.unlit]
+    if not lit:
+        raise InputError(f"{scene.path} has no materials that light falls on: there is nothing to draw")
+    notices = []
+    if len(lit) > MOST:
+        # No areas are read: primitives stand for them, the earlier of the file first.
+        kept = sorted(sorted(range(len(lit)), key=lambda k: (-lit[k].uses, k))[:MOST])
+        notices.append(f"{scene.path} has {len(lit)} materials that light falls on: drawn are the {MOST} that most of "
+                       "its primitives have, their surface is not known")
+        lit = [lit[k] for k in kept]
+    unlit = [m.name for m in scene.materials if m.unlit]
+    if unlit:
+        notices.append(f"{_some(unlit)}: unlit, no sphere is drawn of it")
+    made = tuple(Swatch(_triple(np.clip(middle(m["base_color"]), 0, 1)), float(middle(m["metalness"])[0]),
+                        float(middle(m["roughness"])[0]), insulator(m), m.name) for m in lit)
+    return Laid(made, min(columns, len(made)), notices=(*notices, *_left_out(lit)), scene=str(scene.path))
+
+
+def laid(scene: str | os.PathLike[str] | None, columns: int, rows: int | None,
+         base_color: Sequence[float] | None) -> Laid:
+    """A scene's materials, or the grid where no scene is given. Raises as they and `read_scene` do, UsageError for what
+    is of the grid alone."""
+    if scene is None:
+        return of_grid(columns, 3 if rows is None else rows, (1.0, 1.0, 1.0) if base_color is None else base_color)
+    if rows is not None:
+        raise UsageError("rows are of the grid: a scene has as many as its materials take")
+    if base_color is not None:
+        raise UsageError("base color is of the grid: the materials of a scene have their own")
+    in_range("columns", columns)
+    return of_scene(read_scene(scene), columns)
+
+
+def middle(spread: Spread) -> np.ndarray:
+    """(channels,): the mean over what is in use, of the ends where that is not known."""
+    return np.array(spread.mean) if spread.mean else (np.array(spread.low) + np.array(spread.high)) / 2
+
+
+def insulator(m: Material) -> Triple:
+    """F0 by KHR_materials_ior and KHR_materials_specular: min(((n - 1)/(n + 1))² c, 1) w; an ior of 0 stands for
+    infinity. What neither says is the engines' .04."""
+    ior, weight, tint = middle(m["ior"])[0], middle(m["specular"])[0], middle(m["specular_color"])
+    f0 = DIELECTRIC if ior == 1.5 else 1.0 if ior == 0 else ((ior - 1) / (ior + 1)) ** 2
+    return _triple(np.minimum(f0 * tint, 1) * weight)
+
+
+# What a sphere does not show of a material: when it has it, and what is drawn in its place.
+_KINDS: tuple[tuple[str, Callable[[Material], bool], str], ...] = (
+    ("clear coat", lambda m: m["clearcoat"].most > 0, "the surface under it is drawn"),
+    ("sheen", lambda m: m["sheen_color"].most > 0, "the layer under it is drawn, unscaled"),
+    ("transmission", lambda m: m["transmission"].most > 0, "the sphere is opaque, its base colour diffuse"),
+    ("diffuse transmission", lambda m: m["diffuse_transmission"].most > 0, "all diffuse light is reflected"),
+    ("volume", lambda m: m["transmission"].most > 0 and m["thickness"].most > 0, "nothing is refracted or absorbed"),
+    ("anisotropy", lambda m: m["anisotropy"].most > 0, "the highlight is round"),
+    ("iridescence", lambda m: m["iridescence"].most > 0, "Fresnel's term is that without the film"),
+    ("light of its own", lambda m: m["emission"].most * m["emissive_strength"].most > 0, "only what is reflected is "
+     "drawn"),
+    ("a specular factor below 1", lambda m: m["specular"].least < 1, "F0 is scaled, F90 stays 1"),
+)
+
+_TEXTURED = ("base_color", "metalness", "roughness", "ior", "specular", "specular_color")
+
+
+def _left_out(lit: Sequence[Material]) -> list[str]:
+    found = []
+
+    def told(who: Sequence[Material], what: str) -> None:
+        if who:
+            found.append(f"{_some([m.name for m in who])}: {what}")
+
+    read = [m for m in lit if all(m[name].mean for name in _TEXTURED)]
+    told([m for m in read if any(b - a > EVEN for name in _TEXTURED
+                                 for a, b in zip(m[name].low, m[name].high, strict=True))],
+         "textures vary, the sphere has the mean of what is in use")
+    told([m for m in lit if m not in read], "textures that are not read, the sphere has the middle of what they can be")
+    for what, has, instead in _KINDS:
+        told([m for m in lit if has(m)], f"{what} is left out, {instead}")
+    for name in sorted({name for m in lit for name in m.unread}):
+        told([m for m in lit if name in m.unread], f"{name[:60]} is not read, what it falls back to is drawn")
+    return found
+
+
+def _some(names: Sequence[str]) -> str:
+    shown = ", ".join(names[:3])
+    return shown if len(names) <= 3 else f"{shown} and {len(names) - 3} more"
+
+
+def _triple(values: np.ndarray) -> Triple:
+    x, y, z = map(float, values)
+    return x, y, z

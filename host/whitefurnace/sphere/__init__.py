@@ -1,0 +1,1 @@
+"""Geometry of the sphere: grids of texels, environments, spherical harmonics, suns."""

@@ -1,0 +1,45 @@
+"""The texels of a level that lie nearest some directions: those that a certificate looks at beside its uniform draw."""
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from whitefurnace.sphere.grids import Shape, bounds
+
+TEXELS = 64
+"""Texels of one bound: a tile of 8 × 8."""
+
+CORNERS = [0, 19, 44, 63]
+"""Those at the corners of a tile, in the order of `Shape.tiled`."""
+
+PART = 1 << 18
+"""Texels whose directions are in memory together."""
+
+
+def nearest_texels(shape: Shape, targets: np.ndarray, count: int) -> np.ndarray:
+    """The `count` texels of `shape` nearest to any of the unit directions `targets` (m, 3): flat indices, ascending."""
+    order, centres, radii = _tiles(shape)
+    # |c - t|² of the nearest target; rounding, 1e-8 of a chord, is within what `bounds` adds to a radius.
+    chord = np.sqrt(np.maximum((centres**2).sum(1) + 1 - 2 * (centres @ targets.T).max(1), 0))
+    # The texels of these tiles are enough, and so nothing beyond the farthest of theirs is among the nearest.
+    farthest = np.sort(chord + radii, kind="stable")[min(-(-count // TEXELS) + 1, len(chord)) - 1]
+    tiles = np.flatnonzero(chord - radii <= farthest)
+    index = np.unique(order[tiles])
+    closeness = (targets @ shape.directions(index)).max(0)
+    return np.sort(index[np.argsort(-closeness, kind="stable")[:count]])
+
+
+@lru_cache(maxsize=16)
+def _tiles(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Texels in tiles (n, TEXELS), the last filled up with its last texel; centre (n, 3) of each and largest chord to
+    it (n,)."""
+    order = shape.tiled()
+    order = np.pad(order, (0, -len(order) % TEXELS), mode="edge").reshape(-1, TEXELS)
+    # c·d has no least value inside a tile around c, along rows or columns, while it is positive: its corners tell.
+    small = not any(n % 8 for n in shape.dims[-2:]) and (not shape.latlong or shape.size >= 32)
+    seen = order[:, CORNERS] if small else order
+    part = PART // TEXELS
+    found = np.concatenate([bounds(shape.directions(seen[first:first + part].ravel()), seen.shape[1])
+                            for first in range(0, len(seen), part)])
+    return order, found[:, :3], found[:, 3]

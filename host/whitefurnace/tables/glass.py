@@ -1,0 +1,121 @@
+"""Tables of rough glass: what a boundary of two insulators reflects and lets through, over the view, roughness and
+index of refraction."""
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.catalogue.registry import REFRACTION
+from whitefurnace.catalogue.rule import LADDERS, Rule
+from whitefurnace.errors import UnsupportedError
+from whitefurnace.integrals.quadrature import Grid, Integrated, Part, Tally, climb, grid_of, integrate, missed, room_for
+from whitefurnace.opencl import source
+from whitefurnace.opencl.derived import finest
+from whitefurnace.opencl.device import Device
+from whitefurnace.opencl.launch import CELLS_A_LAUNCH
+from whitefurnace.prefiltering.recipe import Chosen
+
+SCHEMES = ("entering", "leaving")
+"""Light that comes from the side where the index is 1, or from the other: there Fresnel's n is 1/ior."""
+
+IORS = (1.0, 3.0, 16, "f0")
+"""The usual third axis: equal steps of F0^¼, which is √((n - 1)/(n + 1)), as Cycles has them, to OSPRay's largest."""
+
+
+TOLERANCE = 1e-5
+"""The usual tolerance of float32 tables, and the least that float32 is asked for: finer ones are made in float64."""
+
+LOST = 4e-6
+"""What float32 loses of R and T besides, at grazing over narrow lobes: 3.5e-6 at most over the NDFs of the catalogue
+(tests/test_tables_glass.py)."""
+
+
+@dataclass
+class Boundary(Part):
+    """The kernel of reflection and refraction at a boundary."""
+
+    @property
+    def kind(self) -> str:
+        return "gauss"  # its view is n·v alone
+
+    @property
+    def ladder(self) -> tuple[Rule, ...]:
+        return LADDERS["refraction"]
+
+    def cells(self, rows: np.ndarray, precision: int, tolerance: float = 0.0) -> tuple[np.ndarray, int, float]:
+        made, terms, error = super().cells(rows, precision, tolerance)
+        return made, terms, error + (LOST if precision == 32 else 0.0)
+
+    def text(self, terms: int) -> str:
+        return source.refraction(self.slots, terms).text
+
+
+def check(slots: Mapping[str, Chosen]) -> None:
+    """Raises UnsupportedError for models whose masking says nothing of light on the other side, or which have an
+    azimuth."""
+    ndf, masking = slots["ndf"].model, slots["masking"].model
+    if not ndf.isotropic:
+        raise UnsupportedError(f"glass wants an isotropic ndf; {ndf.name} is anisotropic")
+    if "MASKING_G1" not in masking.provides:
+        raise UnsupportedError(f"glass wants a masking of each direction alone, for light on either side; "
+                               f"{masking.name} is none: smith and smith_separable are")
+
+
+def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
+    """Of the kernels, for the key of a table."""
+    return (source.refraction({slot: choice.model for slot, choice in slots.items()}).digest,)
+
+
+def glass(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, out: np.ndarray | None,
+          precision: int, tolerance: float, device: Device, backfacing: str | None = None,
+          **columns: Any) -> tuple[Integrated, dict[str, Any]]:
+    """(…, 2): the shares R and T of the energy that arrives along v, single scattering. [Walter2007]"""
+    start = time.perf_counter()
+    slots = {"ndf": ndf, "masking": masking, "fresnel": fresnel}
+    check(slots)
+    if precision == 64 and not device.fp64:
+        raise UnsupportedError(f"{device.identity()['name']} has no float64")
+    grid = grid_of(REFRACTION, slots, dict(columns), backfacing)
+    n = 1 / grid.columns["fresnel_ior"] if scheme == "leaving" else grid.columns["fresnel_ior"]
+    grid = Grid(grid.shape, {**grid.columns, "fresnel_ior": n})
+    part = Boundary(device, REFRACTION, {slot: choice.model for slot, choice in slots.items()},
+                    32 if tolerance >= TOLERANCE else finest(device))
+    left = tolerance - (LOST if part.precision == 32 else 0.0)
+    values = room_for((*grid.shape, 2), precision, out)
+    flat, tally = values.reshape(grid.size, 2), Tally()
+    # Of light from the denser side the kernel gives what refraction takes from all that F = 1 would reflect.
+    whole, error = None, 0.0
+    if (n < 1).any():
+        plain = {name: value for name, value in columns.items() if name not in ("ior", "fresnel_ior")}
+        whole = integrate("albedo", ndf=ndf, masking=masking, precision=finest(device), tolerance=tolerance / 4,
+                          backfacing=backfacing, device=device, **plain)
+        error = whole.error
+    for begin in range(0, grid.size, CELLS_A_LAUNCH):
+        end = min(begin + CELLS_A_LAUNCH, grid.size)
+        rows = grid.rows(part, begin, end)
+        found = climb(part, rows, left if whole is None else left / 2, tally)
+        if whole is not None:
+            all_of = np.broadcast_to(_beside(whole.values, grid.shape), grid.shape).flat[begin:end]
+            found[0] = np.where(rows[-1] < 1, np.maximum(all_of - found[0], 0), found[0])
+        flat[begin:end] = found.T
+    error += tally.error
+    notices = (*tally.notices(), *missed(error, tolerance, precision))
+    made = Integrated(values, error, tally.evaluations + (whole.evaluations if whole else 0),
+                      time.perf_counter() - start, tally.rule.name if tally.rule else "", notices)
+    if not tell:
+        return made, {}
+    both = flat.sum(1, dtype=np.float64)
+    return made, {"channels": ["reflected", "transmitted"], "largest": float(both.max()), "least": float(both.min()),
+                  "formula": "shares of the energy that arrives along v, once scattered; both scaled by "
+                             "1/(reflected + transmitted) they keep all of it",
+                  "side": "light from the side of index 1" if scheme == "entering" else
+                          "light from the side of index ior: Fresnel's n is 1/ior"}
+
+
+def _beside(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Values over fewer parameters, by the axes of a grid over more, from the right."""
+    return values.reshape((1,) * (len(shape) - values.ndim) + values.shape)

@@ -1,0 +1,1 @@
+"""Checks that hold every model against exact values."""
