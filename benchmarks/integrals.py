@@ -12,9 +12,9 @@ import numpy as np
 
 from whitefurnace import integrate
 from whitefurnace.catalogue import models
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.integrals.quadrature import rows_of_roughness
 from whitefurnace.opencl.device import choose_device
-from whitefurnace.prefiltering.recipe import chosen
 
 TOLERANCE = 1e-5
 

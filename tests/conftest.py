@@ -15,7 +15,7 @@ from whitefurnace.opencl.device import Candidate, Device, choose_device, find_de
 def pytest_configure(config: pytest.Config) -> None:
     # PoCL's cache is not safe for several processes that build the same kernel at once.
     worker = os.environ.get("PYTEST_XDIST_WORKER")
-    if worker and config.cache is not None:
+    if worker and getattr(config, "cache", None) is not None:
         os.environ["POCL_CACHE_DIR"] = str(config.cache.mkdir(f"pocl-{worker}"))
 
 

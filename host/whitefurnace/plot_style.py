@@ -1,39 +1,22 @@
-"""Figures as PNG files: of models, shapes, masking, albedo, Fresnel curves and maps of what float32 is off by; of the
-prefilter, its error against its time.
-
-Every value comes from the device, as users get it; what it is held against is the float64 reference of the catalogue.
-"""
+"""The look of every figure, and the only door to matplotlib: panels laid out on a page and written as PNG."""
 from __future__ import annotations
 
+import contextlib
 import math
-import re
-import textwrap
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from whitefurnace.catalogue import Model, Parameter, model
 from whitefurnace.errors import CheckError, FileError, InputError, UnsupportedError
 from whitefurnace.files import write_atomic
-from whitefurnace.integrals.quadrature import integrate
-from whitefurnace.opencl.derived import Areas, numbers_of
-from whitefurnace.opencl.device import Device
-from whitefurnace.opencl.launch import evaluate
 
-if TYPE_CHECKING:
-    from whitefurnace.benching.tradeoff import Cost, Point
-    from whitefurnace.inspection.comparison import Comparison
-    from whitefurnace.inspection.comparison import Row as Compared
-    from whitefurnace.verification.checks import Row
-
-# matplotlib is loaded by `draw` alone and has no type here: it is an extra, and takes longer to load than a table.
+# matplotlib is an extra and slow to load: it is imported inside functions, and its types are not named here.
 Figure = Any
 Axes = Any
-Numbers = Mapping[str, Any]
 
 DPI = 120
 STYLE: Any = {
@@ -62,14 +45,6 @@ STYLE: Any = {
 GREEN, BLUE, RED = "#009E73", "#0072B2", "#D55E00"
 RGB = {"red": RED, "green": GREEN, "blue": BLUE}
 
-TOLERANCE = 1e-5  # of the curves: less than a line is wide
-FINEST, COARSEST = 1e-8, 1e-5  # what the colours of an error map span: around a rounding of float32, 6e-8
-GUESSES = (0.1, 0.2, 0.4, 0.8)  # for a user's parameters where the rows tell no values: what a roughness may be
-SLOPES = ((0.2, 0.2), (0.4, 0.1), (0.6, 0.03))
-SMITH, RIVAL, FACETS, SCHLICK, EXACT = "smith", "smith_separable", "ggx", "schlick", "dielectric"
-LIGHTS = (0, 45, 75)  # degrees
-SLOT_TITLES = {"ndf": "NDF", "masking": "Masking", "fresnel": "Fresnel", "diffuse": "Diffuse", "brdf": "BRDF"}
-
 
 def require() -> None:
     """Raises UnsupportedError where there is no matplotlib."""
@@ -79,216 +54,59 @@ def require() -> None:
         raise UnsupportedError('figures need matplotlib: pip install "whitefurnace[plot]"') from None
 
 
-def draw(folder: Path, models: Sequence[Model], rows: Sequence[Row], device: Device) -> list[Path]:
-    """One PNG for each model of a slot that has a figure, `folder`/SLOT_NAME.png; the paths, in the models' order.
+@contextlib.contextmanager
+def drawing(path: Path, *, dpi: int | None = None, size: tuple[float, float] | None = None,
+            stated: Mapping[str, str] | None = None) -> Iterator[Figure]:
+    """Give an empty figure in the common style and write it to `path` as PNG when the block ends.
 
-    `rows` give each figure its verdict and a user's model its parameters. The same models, rows and device give the
-    same bytes. Raises UnsupportedError without matplotlib, FileError where the folder cannot be written.
+    The same drawing gives the same bytes, whatever matplotlibrc the machine has.
+    dpi: dots an inch, DPI by default. size: width and height in inches. stated: texts that are stored in the file.
+    Raises UnsupportedError without matplotlib, FileError where the folder or the file cannot be written.
     """
     require()
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    _made(folder)
-    written: list[Path] = []
-    for entry in models:
-        if entry.slot not in _FIGURES:
-            continue
-        with matplotlib.rc_context():
-            matplotlib.rcdefaults()  # not what a matplotlibrc of this machine says
-            matplotlib.rcParams.update(STYLE)
-            own = [row for row in rows if row.slot == entry.slot and _of(row.model, entry)]
-            figure = Figure(dpi=DPI, facecolor="white")
-            FigureCanvasAgg(figure)
-            sheet = _Sheet(figure, entry, _values(entry, own), device)
-            _lay(figure, _FIGURES[entry.slot](sheet))
-            _heading(sheet, own)
-            path = _free(folder / f"{entry.slot}_{entry.name}.png", written)
-            # `Software` names matplotlib's version.
-            write_atomic(path, partial(figure.savefig, format="png", dpi=DPI, metadata={"Software": None}))
-        written.append(path)
-    return written
-
-
-def _made(folder: Path) -> None:
+    dpi = dpi or DPI
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise FileError(f"cannot make {folder}: {error.strerror or error}") from error
-
-
-def draw_tradeoff(folder: Path, points: Sequence[Point], costs: Sequence[Cost], device: Device) -> Path:
-    """`folder`/tradeoff.png: error against seconds for each environment with its Pareto front, then the costs.
-
-    Raises as `draw` does.
-    """
-    require()
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    from whitefurnace.benching.tradeoff import COST_TOLERANCE
-
-    _made(folder)
-    names = list(dict.fromkeys(p.environment for p in points))
-    panels = [_Panel(partial(_tradeoff, [p for p in points if p.environment == name]), 5.4) for name in names]
-    page = [(3.8, panels[k:k + 2]) for k in range(0, len(panels), 2)]
-    varied = list(dict.fromkeys(c.over for c in costs))
-    if varied:
-        page.append((2.6, [_Panel(partial(_cost, [c for c in costs if c.over == over]), 3.3) for over in varied]))
+        raise FileError(f"cannot make {path.parent}: {error.strerror or error}") from error
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(STYLE)
-        figure = Figure(dpi=DPI, facecolor="white")
+        figure = Figure(figsize=size, dpi=dpi, facecolor="white")
         FigureCanvasAgg(figure)
-        _lay(figure, page)
-        whose = f"  ·  cost at a tolerance of {COST_TOLERANCE:g} on {costs[0].environment}" if costs else ""
-        _title(figure, "Prefilter: error against time", f"specular chain on {device.identity()['name']}{whose}", "0.35")
-        path = folder / "tradeoff.png"
-        write_atomic(path, partial(figure.savefig, format="png", dpi=DPI, metadata={"Software": None}))
-    return path
+        yield figure
+        # matplotlib would store its version under `Software`.
+        texts = {**(stated or {}), "Software": None}
+        write_atomic(path, partial(figure.savefig, format="png", dpi=dpi, metadata=texts))
 
 
-CROSS = ((1, 2), (1, 0), (0, 1), (2, 1), (1, 1), (1, 3))
-"""Row and column of +X -X +Y -Y +Z -Z in a horizontal cross (environments.LAYOUTS)."""
-
-
-def draw_comparison(folder: Path, found: Comparison) -> Path:
-    """`folder`/compare.png: a map of the errors of each level, cubes as crosses, and of each channel of a table.
-
-    Raises as `draw` does.
-    """
-    require()
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    _made(folder)
-    # The colours of one file's maps are alike: five decades down from the worst.
-    shown = [row for row in found.rows if row.errors is not None]
-    largest = {kind: max((row.worst for row in shown if row.kind == kind and math.isfinite(row.worst)), default=1.0)
-               for kind in ("level", "table")}
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)
-        figure = Figure(dpi=DPI, facecolor="white")
-        FigureCanvasAgg(figure)
-        panels = [_Panel(partial(_error_map, figure, row, largest[row.kind] or 1.0), 4.6, after=0.5) for row in shown]
-        _lay(figure, [(3.45, panels[k:k + 2]) for k in range(0, len(panels), 2)])
-        _title(figure, "Errors of A against B", f"{found.a.path.name}  against  {found.b.path.name}", "0.35")
-        path = folder / "compare.png"
-        write_atomic(path, partial(figure.savefig, format="png", dpi=DPI, metadata={"Software": None}))
-    return path
-
-
-def draw_beside(path: Path, pictures: Sequence[np.ndarray], difference: np.ndarray, scale: float, engine: str,
-                caption: Sequence[str], stated: Mapping[str, str]) -> None:
-    """Two pictures (h, w, 3) in [0, 1], the engine's and the truth, and the map (h, w) of what they differ by, NaN
-    where it is of nothing, its colours from -scale to scale: pixel by pixel, one below the other where they are wide.
-
-    `stated` goes into the file's text. Raises as `draw` does.
-    """
-    require()
-    import matplotlib
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    high, wide = difference.shape
-    head, gap, bar, dpi = 34, 12, 84, 100
-    below = wide > 1.5 * high
-    columns, rows = (1, 3) if below else (3, 1)
-    width = max(columns * wide + (columns + 1) * gap + bar, 460)
-    # A letter of 9 points is 6.5 pixels wide on average.
-    caption = [part for line in caption for part in textwrap.wrap(line, int((width - 2 * gap) / 6.5))]
-    foot = 16 + 16 * len(caption)
-    height = rows * (high + head) + gap + foot
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(STYLE)
-        figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
-        FigureCanvasAgg(figure)
-        titles = (f"{engine}, from its files", "the full integral", "(engine - truth) / truth, luminance")
-        for k, (title, shown) in enumerate(zip(titles, (*pictures, difference), strict=True)):
-            left = gap + (0 if below else k * (wide + gap))
-            top = (k + 1) * head + k * high if below else head
-            axes = figure.add_axes((left / width, 1 - (top + high) / height, wide / width, high / height))
-            axes.set_axis_off()
-            options: dict[str, Any] = {"interpolation": "none", "aspect": "auto"}
-            if k == 2:
-                colours = matplotlib.colormaps["RdBu_r"].with_extremes(bad="0.8")
-                options |= {"cmap": colours, "vmin": -scale, "vmax": scale}
-            image = axes.imshow(np.ma.masked_invalid(shown), **options)
-            figure.text(left / width, 1 - (top - 9) / height, title, fontsize=11, color="0.15")
-        inset = figure.add_axes(((left + wide + 10) / width, 1 - (top + high) / height, 14 / width, high / height))
-        marks = np.linspace(-scale, scale, 5)
-        marked = figure.colorbar(image, cax=inset, ticks=marks)
-        marked.ax.set_yticklabels([f"{100 * x:+.3g} %" if x else "0" for x in marks], fontsize=9)
-        marked.outline.set_visible(False)
-        for k, line in enumerate(caption):
-            figure.text(gap / width, (12 + 16 * (len(caption) - 1 - k)) / height, line, fontsize=9, color="0.35")
-        write_atomic(path, partial(figure.savefig, format="png", dpi=dpi, metadata={**stated, "Software": None}))
-
-
-def _error_map(figure: Figure, row: Compared, largest: float, axes: Axes) -> None:
-    import matplotlib
+def logarithmic_scale(low: float, high: float) -> Any:
+    """A logarithmic scale of colours from `low` to `high`."""
     from matplotlib.colors import LogNorm
 
-    errors = np.asarray(row.errors, np.float64)
-    if errors.ndim == 3 and errors.shape[0] == 6 and row.kind == "level":
-        n = errors.shape[1]
-        flat = np.full((3 * n, 4 * n), np.nan)
-        for face, (down, across) in zip(errors, CROSS, strict=True):
-            flat[down * n:(down + 1) * n, across * n:(across + 1) * n] = face
-    else:
-        flat = errors.reshape(-1, errors.shape[-1])
-    colours = matplotlib.colormaps["cividis"]
-    colours = colours.with_extremes(bad=(1, 1, 1, 0), under=colours(0.0), over=RED)
-    axes.grid(False)
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_visible(False)
-    flat = np.clip(flat, 1e-300, 1e300)  # the logarithm of 0, and of what is not finite in one file
-    image = axes.imshow(np.ma.masked_invalid(flat), cmap=colours, norm=LogNorm(1e-5 * largest, largest),
-                        interpolation="nearest")
-    roughness = "" if row.roughness is None else f", r = {row.roughness:.3g}"
-    axes.set_title(f"{row.part}, {row.size}{roughness}: {_small(row.error)}, worst {_small(row.worst)}"
-                   if math.isfinite(row.worst) else f"{row.part}, {row.size}{roughness}: red is not finite")
-    _bar(figure, axes, image, extend="both")
+    return LogNorm(low, high)
 
 
-def _tradeoff(points: Sequence[Point], axes: Axes) -> None:
-    best = sorted((p.seconds.median, p.error) for p in points if p.front)
-    if best:
-        # What is on the front is to be had in that time and all longer ones.
-        x, y = (np.array(v) for v in zip(*best, strict=True))
-        last = max(p.seconds.high for p in points)
-        axes.step(np.append(x, last), np.append(y, y[-1]), where="post", color="0.85", linewidth=6, zorder=1,
-                  label="Pareto front")
-    for method, colour, mark in (("tolerance", BLUE, "o"), ("samples", RED, "s")):
-        some = [p for p in points if p.method == method]
-        if some:
-            x = np.array([p.seconds.median for p in some])
-            spread = np.array([[p.seconds.median - p.seconds.low, p.seconds.high - p.seconds.median] for p in some]).T
-            axes.errorbar(x, [p.error for p in some], xerr=spread, color=colour, marker=mark, elinewidth=1,
-                          linewidth=1.2, label=method)
-        for p in some:
-            axes.annotate(p.label, (p.seconds.median, p.error), xytext=(5, 5), textcoords="offset points", fontsize=8.5,
-                          color="0.3")
-    axes.set(xscale="log", yscale="log", xlabel="seconds, from texels to levels",
-             ylabel="stated error of the worst level", title=points[0].environment)
-    axes.margins(0.12)
-    _seconds(axes.xaxis)
-    _legend(axes, inside="upper right")
+def linear_scale(low: float, high: float) -> Any:
+    """A linear scale of colours from `low` to `high`."""
+    from matplotlib.colors import Normalize
+
+    return Normalize(low, high)
 
 
-COST_LABELS = {"output size": ("output size", "face edge of level 0"),
-               "source rows": ("source size", "rows of the source"),
-               "alpha": ("α", "α of one level")}
+def colours_named(name: str, **extremes: Any) -> Any:
+    """A colour map of matplotlib by its name, with colours for values under, over or bad."""
+    import matplotlib
+
+    found = matplotlib.colormaps[name]
+    return found.with_extremes(**extremes) if extremes else found
 
 
-def _seconds(axis: Any) -> None:
+def seconds_axis(axis: Any) -> None:
     """Ticks closer than decades where measured times lie within one or two."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
@@ -299,157 +117,7 @@ def _seconds(axis: Any) -> None:
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def _cost(costs: Sequence[Cost], axes: Axes) -> None:
-    x = [c.value for c in costs]
-    axes.fill_between(x, [c.seconds.low for c in costs], [c.seconds.high for c in costs], color=BLUE, alpha=0.2,
-                      linewidth=0)
-    axes.plot(x, [c.seconds.median for c in costs], color=BLUE, marker="o", markersize=5)
-    title, label = COST_LABELS[costs[0].over]
-    axes.set(xscale="log", yscale="log", xlabel=label, ylabel="seconds", title=f"Cost over {title}")
-    if costs[0].over != "alpha":
-        axes.set_xticks(x, [f"{v:g}" for v in x], minor=False)
-        axes.set_xticks([], minor=True)
-    _seconds(axes.yaxis)
-
-
-@dataclass(frozen=True)
-class _Sheet:
-    """What a figure is drawn of: its model, with the values to show of each parameter."""
-
-    figure: Figure
-    entry: Model
-    values: Mapping[str, tuple[float, ...]]
-    device: Device
-
-    def usual(self) -> dict[str, Any]:
-        """A telling value of each parameter: a middling one."""
-        defaults = {p.name: p.default for p in self.entry.parameters if p.default is not None}
-        if self.entry.slot == "diffuse":  # white and at its least like Lambert
-            return {name: values[-1] for name, values in self.values.items()} | defaults
-        return {name: values[len(values) // 2] for name, values in self.values.items()} | defaults
-
-    def families(self) -> list[_Family]:
-        """One for each parameter that is worth varying; a single one without a name where there is none."""
-        usual = self.usual()
-        found = [_Family(p, self.values[p.name], {k: v for k, v in usual.items() if k != p.name})
-                 for p in self.entry.parameters if len(self.values[p.name]) > 1]
-        return found or [_Family(None, (0.0,), usual)]
-
-
-@dataclass(frozen=True)
-class _Family:
-    """Curves by the values of one parameter, the others held."""
-
-    parameter: Parameter | None
-    values: tuple[float, ...]
-    held: Mapping[str, float]
-
-    def numbers(self, values: Any) -> dict[str, Any]:
-        own = {} if self.parameter is None else {self.parameter.name: values}
-        return {**self.held, **own}
-
-    def rows(self, values: Any) -> np.ndarray:
-        """(values, x), also of a family without a parameter."""
-        return np.atleast_2d(np.asarray(values, np.float64))
-
-    @property
-    def columns(self) -> dict[str, Any]:
-        """Parameters with the family along the first of two axes."""
-        return self.numbers(np.array(self.values)[:, None])
-
-    def labels(self, entry: Model) -> list[str]:
-        if self.parameter is None:
-            return [self._held(entry) or entry.name]
-        return [f"{_symbol(self.parameter)} = {_number(v)}" for v in self.values]
-
-    def caption(self, entry: Model) -> str:
-        """The parameters held, for the legend's head."""
-        return "" if self.parameter is None else self._held(entry)
-
-    def _held(self, entry: Model) -> str:
-        symbols = {p.name: _symbol(p) for p in entry.parameters}
-        return ", ".join(f"{symbols[name]} = {_number(v)}" for name, v in self.held.items())
-
-
-def _of(label: str, entry: Model) -> bool:
-    """Whether a row's label, NAME or FILE.clh with parameters after a colon, is of this model."""
-    name = entry.path or entry.name
-    return label == name or label.startswith(f"{name}:")
-
-
-def _values(entry: Model, rows: Sequence[Row]) -> dict[str, tuple[float, ...]]:
-    """What to show of each parameter: its typical values, else those of the rows, else guesses."""
-    found = {}
-    for p in entry.parameters:
-        # Six digits: of one value there are rows as float32 has it and as float64 does.
-        seen = [float(f"{row.parameters[p.name]:.6g}") for row in rows if p.name in row.parameters]
-        values = sorted(set(p.typical or seen or GUESSES))
-        found[p.name] = tuple(values[round(k)] for k in np.linspace(0, len(values) - 1, min(len(values), 7)))
-    return found
-
-
-def _free(path: Path, taken: Iterable[Path]) -> Path:
-    """`path`, numbered where a model before it has the same slot and name: a user's beside ours."""
-    names, number = {p.name for p in taken}, 1
-    free = path
-    while free.name in names:
-        number += 1
-        free = path.with_stem(f"{path.stem}_{number}")
-    return free
-
-
-# ---------------------------------------------------------------------------------------------- values
-
-
-def _evaluate(device: Device, function: str, slots: Mapping[str, Model], own: Sequence[Any],
-              numbers: Mapping[str, Numbers], precision: int = 32) -> np.ndarray:
-    """A model function at its own arguments and the parameters of each slot, all broadcast, as float64; RGB first."""
-    columns = [*own, *(numbers[slot][p.name] for slot, m in slots.items() for p in m.parameters)]
-    arrays = np.broadcast_arrays(*(np.asarray(c, np.float64) for c in columns))
-    shape = arrays[0].shape
-    flat = np.array([a.ravel() for a in arrays])
-    read, terms, cells = len(own), 0, [flat[:len(own)]]
-    for slot, entry in slots.items():
-        count = len(entry.parameters)
-        cells.append(numbers_of(device, entry, flat[read:read + count]))
-        read += count
-        if slot == "ndf" and "NDF_AREA" not in entry.provides and len(slots) > 1:
-            table = Areas(device, entry, precision).table(cells[-1])
-            terms, area = table.length, table.rows
-    if terms:
-        cells.append(area)
-    out = evaluate(device, function, slots, np.concatenate(cells), precision, terms).astype(np.float64)
-    return out.reshape(shape) if len(out) == 1 else out.reshape(len(out), *shape)
-
-
-def _rounded(values: Any) -> np.ndarray:
-    """As float32 has them: an error map is of the kernel, not of its input."""
-    return np.asarray(values, np.float32).astype(np.float64)
-
-
-def _towards(theta: Any, phi: Any = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The direction at polar angles, in the local frame."""
-    theta, phi = np.broadcast_arrays(np.asarray(theta, np.float64), np.asarray(phi, np.float64))
-    return np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)
-
-
-def _axis(parameter: Parameter, values: Sequence[float], count: int) -> tuple[np.ndarray, bool]:
-    """Values over a parameter's domain, and whether by their logarithm; a user's knows only the values shown."""
-    low, high = (parameter.low, parameter.high) if parameter.typical else (values[0], values[-1])
-    least = low if low > 0 else min((v for v in values if v > 0), default=1.0)
-    if low >= 0 and high >= 50 * least and (low > 0 or high >= 1e3 * least):
-        return np.geomspace(least, high, count), True
-    return np.linspace(low, high, count), False
-
-
-COSINES = np.sin(np.linspace(0.02, math.pi / 2, 97)) ** 2
-"""n·v of the curves: more of them at both ends."""
-
-
-# ---------------------------------------------------------------------------------------------- ink
-
-
-def _number(value: float) -> str:
+def number_label(value: float) -> str:
     """A number for a label: powers of ten as such."""
     power = round(math.log10(abs(value))) if value else 0
     if abs(power) >= 3 and math.isclose(value, 10.0**power):
@@ -457,27 +125,21 @@ def _number(value: float) -> str:
     return f"{value:.3g}".replace("-", "−")
 
 
-def _small(value: float) -> str:
+def small_label(value: float) -> str:
     mantissa, _, power = f"{value:.1e}".partition("e")
     superscript = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"{mantissa}×10{superscript}" if value else "0"
 
 
-def _shades(count: int) -> list[Any]:
+def shades(count: int) -> list[Any]:
     """Colours in order, dark to light, none too light for white paper."""
     import matplotlib
 
     return [matplotlib.colormaps["viridis"](x) for x in np.linspace(0.0, 0.86, count)] if count > 1 else [BLUE]
 
 
-def _symbol(parameter: Parameter) -> str:
-    """A parameter's symbol, what follows the first letter of a short one below the line: αx, F82."""
-    short = re.fullmatch(r"([^\W\d_])([xy]|\d+)", parameter.symbol)
-    return rf"$\mathrm{{{short[1]}}}_{{\mathrm{{{short[2]}}}}}$" if short else parameter.symbol
-
-
 @dataclass(frozen=True)
-class _Panel:
+class Panel:
     """What paints one set of axes, their width and the room after them for a legend or a bar of colours, inches."""
 
     paint: Callable[[Axes], None]
@@ -487,14 +149,14 @@ class _Panel:
     """First and last angle, degrees."""
 
 
-Page = Sequence[tuple[float, Sequence[_Panel]]]
+Page = Sequence[tuple[float, Sequence[Panel]]]
 """Rows of panels with their heights, inches."""
 
 HEAD, ABOVE, BELOW, LEFT = 0.75, 0.5, 0.65, 0.87
 LEAST = 10.0  # of the width: room for the heading
 
 
-def _lay(figure: Figure, page: Page) -> None:
+def lay_out(figure: Figure, page: Page) -> None:
     """Every panel at its place in inches: panels of one row are alike whatever their labels take."""
     width = max(LEAST, *(sum(LEFT + p.width + p.after for p in row) for _, row in page))
     height = HEAD + sum(ABOVE + h + BELOW for h, _ in page)
@@ -512,25 +174,13 @@ def _lay(figure: Figure, page: Page) -> None:
         top -= ABOVE + high + BELOW
 
 
-def _heading(sheet: _Sheet, rows: Sequence[Row]) -> None:
-    figure, entry = sheet.figure, sheet.entry
-    failed = sorted({row.check for row in rows if not row.passed})
-    said = [SLOT_TITLES[entry.slot], f"[{entry.citation}]" if entry.citation else "",
-            f"float32 on {sheet.device.identity()['name']}"]
-    if rows:
-        said.append(f"{sum(row.passed for row in rows)} of {len(rows)} checks passed"
-                    + (f", failed: {', '.join(failed[:2])}{' …' if len(failed) > 2 else ''}" if failed else ""))
-    title = entry.title if entry.text is None else f"{entry.name}, {entry.title}"
-    _title(figure, title, "  ·  ".join(filter(None, said)), RED if failed else "0.35")
-
-
-def _title(figure: Figure, title: str, said: str, colour: str) -> None:
+def heading(figure: Figure, title: str, said: str, colour: str) -> None:
     width, height = figure.get_size_inches()
     figure.text(0.25 / width, 1 - 0.2 / height, title, fontsize=18, fontweight="bold", va="top")
     figure.text(0.25 / width, 1 - 0.57 / height, said, fontsize=11, va="top", color=colour)
 
 
-def _legend(axes: Axes, title: str = "", inside: str | tuple[float, float] | None = None) -> None:
+def add_legend(axes: Axes, title: str = "", inside: str | tuple[float, float] | None = None) -> None:
     """Beside the axes, or in a corner of them that the caller knows to be free."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
@@ -554,17 +204,6 @@ def _try(axes: Axes, paint: Callable[[Axes], None]) -> None:
         axes.text(0.5, 0.5, fill(str(error), 38), ha="center", va="center", color="0.35", transform=axes.transAxes)
 
 
-def _degrees(axes: Axes, low: float = 0, high: float = 90, step: float = 15, label: str = "θ (degrees)") -> None:
-    axes.set_xlim(low, high)
-    axes.set_xticks(np.arange(low, high + 1, step))
-    axes.set_xlabel(label)
-
-
-def _cosine_axis(axes: Axes) -> None:
-    axes.set_xlim(0, 1)
-    axes.set_xlabel("n·v  (0 grazing, 1 normal)")
-
-
 def _polar(figure: Figure, box: tuple[float, ...], low: int, high: int) -> Axes:
     axes = figure.add_axes(box, projection="polar")
     axes.set_theta_zero_location("N")
@@ -577,608 +216,9 @@ def _polar(figure: Figure, box: tuple[float, ...], low: int, high: int) -> Axes:
     return axes
 
 
-def _map(figure: Figure, axes: Axes, x: np.ndarray, y: np.ndarray, error: np.ndarray) -> None:
-    """A map of errors in the colours that all of them share; grey where there is nothing to compare."""
-    import matplotlib
-    from matplotlib.colors import LogNorm
-
-    colours = matplotlib.colormaps["cividis"]
-    colours = colours.with_extremes(under=colours(0.0))
-    axes.set_facecolor("0.85")
-    axes.grid(False)
-    mesh = axes.pcolormesh(x, y, np.ma.masked_invalid(np.maximum(error, 1e-300)), cmap=colours, shading="nearest",
-                           norm=LogNorm(FINEST, COARSEST), rasterized=True)
-    _bar(figure, axes, mesh, extend="both")
-
-
-def _bar(figure: Figure, axes: Axes, mesh: Any, label: str = "", **options: Any) -> None:
+def colour_bar(figure: Figure, axes: Axes, mesh: Any, label: str = "", **options: Any) -> None:
     """The scale of colours, right beside its map."""
     inch = figure.dpi / axes.bbox.width
     bar = figure.colorbar(mesh, cax=axes.inset_axes([1 + 0.1 * inch, 0, 0.14 * inch, 1]), label=label, **options)
     bar.outline.set_visible(False)
     bar.ax.minorticks_off()
-
-
-def _largest(error: np.ndarray) -> str:
-    return f"at most {_small(float(np.nanmax(error)))}" if np.isfinite(error).any() else "nothing to compare"
-
-
-# ---------------------------------------------------------------------------------------------- NDF
-
-
-def _ndf(sheet: _Sheet) -> Page:
-    """A row of panels for each parameter (D twice, G1, E), under them what float32 is off by."""
-    if not sheet.entry.isotropic:
-        return _anisotropic(sheet)
-    families = sheet.families()[:3]
-    mapped = families[:2]
-    wide = 7.6 if len(mapped) == 1 else 2.9
-    maps = [panel for family in mapped for panel in (
-        _Panel(partial(_ndf_error, sheet, family), wide, 0.95),
-        _Panel(partial(_furnace_error, sheet, family), wide, 0.95))]
-    return [*((3.1, _ndf_row(sheet, family)) for family in families), (2.9, maps)]
-
-
-def _ndf_row(sheet: _Sheet, family: _Family) -> list[_Panel]:
-    entry, device = sheet.entry, sheet.device
-    labels, colours = family.labels(entry), _shades(len(family.values))
-
-    def shape(axes: Axes) -> None:
-        theta = np.radians(np.concatenate([np.geomspace(1e-3, 60, 260), np.linspace(60.5, 89.999, 90)]))
-        D = family.rows(_evaluate(device, "NDF_D", {"ndf": entry}, [np.cos(theta), np.sin(theta) ** 2],
-                                  {"ndf": family.columns}))
-        for values, colour, label in zip(D, colours, labels, strict=True):
-            axes.loglog(np.degrees(theta), np.where(values > 0, values, np.nan), color=colour, label=label)
-        axes.set(title="D, both axes logarithmic", xlabel="θ (degrees)", ylabel="D (1/sr)", xlim=(1e-3, 90))
-        top = float(D.max())
-        axes.set_ylim(max(min(1e-6, top * 1e-6), float(np.min(D[D > 0], initial=top)) / 2), top * 4)
-        axes.set_xticks([1e-3, 1e-2, 0.1, 1, 10, 90], ["0.001", "0.01", "0.1", "1", "10", "90"])
-        axes.minorticks_off()
-
-    def lobe(axes: Axes) -> None:
-        theta = np.radians(np.concatenate([np.geomspace(1e-3, 10, 200), np.linspace(10.1, 89.999, 320)]))
-        D = family.rows(_evaluate(device, "NDF_D", {"ndf": entry}, [np.cos(theta), np.sin(theta) ** 2],
-                                  {"ndf": family.columns}))
-        for values, colour in zip(D, colours, strict=True):
-            axes.plot(theta, values / values.max(), color=colour)
-        axes.set_ylim(0, 1.02)
-        axes.set_rgrids([0.25, 0.5, 0.75, 1], ["", "0.5", "", "1"])
-        axes.set_title("D / its peak, over θ", x=0.1, y=1.0)  # beside the label of 0°
-
-    def masking(axes: Axes) -> None:
-        slots = {"ndf": entry, "masking": model("masking", SMITH)}
-        numbers = {"ndf": family.columns, "masking": {}}
-        at = _evaluate(device, "MASKING_AT", slots, [COSINES], numbers)
-        G1 = _evaluate(device, "MASKING_G1", slots, [COSINES, at], numbers)
-        for values, colour in zip(family.rows(G1), colours, strict=True):
-            axes.plot(COSINES, values, color=colour)
-        axes.set(title="Masking $G_1$, Smith", ylim=(0, 1.03), ylabel="$G_1$")
-        _cosine_axis(axes)
-
-    def albedo(axes: Axes) -> None:
-        E = integrate("albedo", ndf=entry, NoV=COSINES, tolerance=TOLERANCE, device=device, **family.columns).values
-        for values, colour, label in zip(family.rows(E), colours, labels, strict=True):
-            axes.plot(COSINES, values, color=colour, label=label)
-        axes.set(title="Directional albedo, Smith, F = 1", ylim=(0, 1.03), ylabel="E")
-        _cosine_axis(axes)
-        _legend(axes, family.caption(entry))
-
-    room = max(1.45, 0.75 + 0.09 * max(len(text) for text in (*labels, family.caption(entry))))
-    return [_Panel(shape, 3.7), _Panel(lobe, 3.1, polar=(0, 90)), _Panel(masking, 3.2), _Panel(albedo, 3.2, room)]
-
-
-def _float64(sheet: _Sheet, cos_m: np.ndarray, sin2_m: np.ndarray, theta: np.ndarray, numbers: Numbers) -> np.ndarray:
-    """D to hold float32's against: the reference, or a user's own text in float64."""
-    if "D" in sheet.entry.reference:
-        with np.errstate(all="ignore"):
-            return np.asarray(sheet.entry.reference["D"](theta, **numbers), np.float64)
-    if not sheet.device.fp64:
-        raise UnsupportedError(f"{sheet.device.identity()['name']} has no float64 to compare with")
-    return _evaluate(sheet.device, "NDF_D", {"ndf": sheet.entry}, [cos_m, sin2_m], {"ndf": numbers}, 64)
-
-
-def _ndf_error(sheet: _Sheet, family: _Family, axes: Axes) -> None:
-    # cos θ and sin²θ as float32 has them, the angle from the one of them that tells it better.
-    theta = np.radians(np.concatenate([np.geomspace(1e-3, 10, 90), np.linspace(10.5, 89.9, 90)]))
-    small = theta < math.pi / 4
-    sin2 = np.where(small, _rounded(np.sin(theta) ** 2), 1 - _rounded(np.cos(theta)) ** 2)
-    cosine = np.where(small, np.sqrt(1 - sin2), _rounded(np.cos(theta)))
-    angle = np.where(small, np.arcsin(np.sqrt(sin2)), np.arccos(cosine))
-
-    def error(values: np.ndarray) -> np.ndarray:
-        numbers = family.numbers(_rounded(values)[:, None])
-        numbers = {name: _rounded(v) for name, v in numbers.items()}
-        got = family.rows(_evaluate(sheet.device, "NDF_D", {"ndf": sheet.entry}, [cosine, sin2], {"ndf": numbers}))
-        want = np.broadcast_to(_float64(sheet, cosine, sin2, angle, numbers), got.shape)
-        peak = want.max(1, keepdims=True)
-        # float32 ends at 1e-38, and a factor of D before D: nothing to compare.
-        with np.errstate(all="ignore"):
-            return np.where(want > np.maximum(1e-30 * peak, 1e-30), np.abs(got / want - 1), np.nan)
-
-    ticks = [1e-3, 0.1, 1, 10, 90], ["0.001", "0.1", "1", "10", "90"]
-    _error_panel(sheet, family, axes, np.degrees(theta), error, "Relative error of D", True)
-    axes.set(xlim=(1e-3, 90), xlabel="θ (degrees)")
-    axes.set_xticks(*ticks)
-    axes.minorticks_off()
-
-
-def _furnace_error(sheet: _Sheet, family: _Family, axes: Axes) -> None:
-    NoV = np.geomspace(1e-3, 1, 48)
-
-    def error(values: np.ndarray) -> np.ndarray:
-        got = integrate("weak_furnace", ndf=sheet.entry, NoV=NoV, device=sheet.device,
-                        **family.numbers(values[:, None])).values
-        return np.abs(family.rows(got) - 1)
-
-    _error_panel(sheet, family, axes, NoV, error, "Weak white furnace less 1", True)
-    axes.set(xlim=(1e-3, 1), xlabel="n·v")
-
-
-def _error_panel(sheet: _Sheet, family: _Family, axes: Axes, x: np.ndarray,
-                 error: Callable[[np.ndarray], np.ndarray], what: str, log: bool) -> None:
-    """A map over x and the family's parameter, or lines where that has a single value."""
-    p = family.parameter
-    if p is None:
-        values = error(np.array(family.values))
-        axes.plot(x, np.maximum(values[0], 1e-9), ".", color=BLUE)
-        axes.set(yscale="log", ylim=(1e-9, max(COARSEST, 2 * float(np.nanmax(values)))), ylabel="error")
-    else:
-        y, log_y = _axis(p, family.values, 56)
-        values = error(y)
-        _map(sheet.figure, axes, x, y, values)
-        axes.set(yscale="log" if log_y else "linear", ylim=(y[0], y[-1]),
-                 ylabel=_symbol(p) + ("" if p.unit in ("", "1") else f" ({p.unit})"))
-    if log:
-        axes.set_xscale("log")
-    axes.set_title(f"{what}: {_largest(values)}", fontsize=11)
-
-
-def _anisotropic(sheet: _Sheet) -> Page:
-    """D over slopes for three pairs of roughness; G1 and E by azimuth; errors by azimuth."""
-    from matplotlib.colors import LogNorm
-
-    figure, entry, device = sheet.figure, sheet.entry, sheet.device
-    names = [p.name for p in entry.parameters]
-    symbols = [_symbol(p) for p in entry.parameters]
-    usual = sheet.usual()
-    sets = [{**usual, **dict(zip(names, pair, strict=False))} for pair in SLOPES]
-
-    def caption(numbers: Numbers) -> str:
-        return ", ".join(f"{s} = {_number(numbers[n])}" for s, n in zip(symbols, names, strict=True))
-
-    slope = np.linspace(-1, 1, 241)
-    x, y = np.meshgrid(slope, slope)
-    long = np.sqrt(1 + x * x + y * y)
-
-    def slopes(numbers: Numbers, last: bool, axes: Axes) -> None:
-        D = _evaluate(device, "NDF_D", {"ndf": entry}, [-x / long, -y / long, 1 / long], {"ndf": numbers})
-        share = np.maximum(D / D.max(), 1e-30)
-        mesh = axes.pcolormesh(slope, slope, share, cmap="inferno", norm=LogNorm(1e-5, 1), shading="nearest",
-                               rasterized=True)
-        axes.contour(slope, slope, share, levels=[1e-4, 1e-3, 1e-2, 1e-1], colors="white", linewidths=0.6, alpha=0.6)
-        axes.grid(False)
-        axes.set(xlabel="slope along x", ylabel="slope along y", xticks=[-1, -0.5, 0, 0.5, 1],
-                 yticks=[-1, -0.5, 0, 0.5, 1], title=f"D, {caption(numbers)}, peak {_number(float(D.max()))} / sr")
-        if last:
-            _bar(figure, axes, mesh, "D / its peak", extend="min")
-
-    numbers = sets[1]
-    turns = np.radians([0, 30, 60, 90])
-    colours = _shades(len(turns))
-    labels = [f"φ = {round(math.degrees(t))}°" for t in turns]
-    v = _towards(np.arccos(COSINES), turns[:, None])
-
-    def masking(axes: Axes) -> None:
-        slots = {"ndf": entry, "masking": model("masking", SMITH)}
-        own = {"ndf": numbers, "masking": {}}
-        G1 = _evaluate(device, "MASKING_G1", slots, [v[2], _evaluate(device, "MASKING_AT", slots, v, own)], own)
-        for values, colour, label in zip(G1, colours, labels, strict=True):
-            axes.plot(COSINES, values, color=colour, label=label)
-        axes.set(title=f"Masking $G_1$, Smith, {caption(numbers)}", ylim=(0, 1.03), ylabel="$G_1$")
-        _cosine_axis(axes)
-
-    def albedo(axes: Axes) -> None:
-        E = integrate("albedo", ndf=entry, NoV=COSINES, phi=turns[:, None], tolerance=TOLERANCE, device=device,
-                      **numbers).values
-        for values, colour, label in zip(E, colours, labels, strict=True):
-            axes.plot(COSINES, values, color=colour, label=label)
-        axes.set(title="Directional albedo, Smith, F = 1", ylim=(0, 1.03), ylabel="E")
-        _cosine_axis(axes)
-        _legend(axes)
-
-    around = np.linspace(0, math.pi / 2, 40)
-
-    def shape_error(axes: Axes) -> None:
-        theta = np.radians(np.linspace(0.25, 89.75, 120))
-        m = [_rounded(c) for c in _towards(theta, around[:, None])]
-        own = {name: float(_rounded(value)) for name, value in numbers.items()}
-        got = _evaluate(device, "NDF_D", {"ndf": entry}, m, {"ndf": own})
-        want = entry.reference["D"](np.arctan2(np.hypot(m[0], m[1]), m[2]), np.arctan2(m[1], m[0]), **own)
-        with np.errstate(all="ignore"):
-            error = np.where(want > max(1e-30, 1e-30 * float(want.max())), np.abs(got / want - 1), np.nan)
-        _map(figure, axes, np.degrees(theta), np.degrees(around), error)
-        axes.set(ylabel="φ (degrees)", yticks=[0, 30, 60, 90])
-        axes.set_title(f"Relative error of D: {_largest(error)}", fontsize=11)
-        _degrees(axes, step=30)
-
-    def furnace(axes: Axes) -> None:
-        NoV = np.geomspace(1e-3, 1, 36)
-        got = integrate("weak_furnace", ndf=entry, NoV=NoV, phi=around[::2, None], device=device, **numbers).values
-        error = np.abs(np.asarray(got, np.float64) - 1)
-        _map(figure, axes, NoV, np.degrees(around[::2]), error)
-        axes.set(xscale="log", xlabel="n·v", ylabel="φ (degrees)", yticks=[0, 30, 60, 90])
-        axes.set_title(f"Weak white furnace less 1: {_largest(error)}", fontsize=11)
-
-    heat = [_Panel(partial(slopes, n, n is sets[-1]), 4.4, 1.1 if n is sets[-1] else 0.3)
-            for n in sets]
-    return [(4.4, heat), (3.1, [_Panel(masking, 2.8), _Panel(albedo, 2.8, 1.25), _Panel(shape_error, 2.6, 0.95),
-                                _Panel(furnace, 2.6, 0.95)])]
-
-
-# ---------------------------------------------------------------------------------------------- masking
-
-
-DASHED = (0, (4, 2.5))
-
-
-def _masking(sheet: _Sheet) -> Page:
-    """G and V as v sweeps through the plane of l, and the energy they leave, against Smith's, for GGX."""
-    rival = model("masking", RIVAL if sheet.entry.name == SMITH else SMITH)
-    return [(3.5, [_Panel(partial(_sweep, sheet, alpha, rival, "G"), 4.2),
-                   _Panel(partial(_sweep, sheet, alpha, rival, "V"), 4.2, 1.95),
-                   _Panel(partial(_energy, sheet, alpha, rival), 3.6, 2.15)])
-            for alpha in (0.1, 0.5)]
-
-
-def _own(of: Model, alpha: float) -> dict[str, Any]:
-    """A masking model's parameters beside an NDF of this roughness."""
-    return {p.name: alpha if p.name == "alpha" else p.typical[len(p.typical) // 2] for p in of.parameters}
-
-
-def _sweep(sheet: _Sheet, alpha: float, rival: Model, function: str, axes: Axes) -> None:
-    theta = np.radians(np.linspace(-89.5, 89.5, 359))
-    for degrees, colour in zip(LIGHTS, _shades(len(LIGHTS)), strict=True):
-        light = math.radians(degrees)
-        NoV, NoL = np.cos(theta), np.full_like(theta, math.cos(light))
-        curves = {}
-        for of in (sheet.entry, rival):
-            slots = {"ndf": model("ndf", FACETS), "masking": of}
-            numbers = {"ndf": {"alpha": alpha}, "masking": _own(of, alpha)}
-            at = [_evaluate(sheet.device, "MASKING_AT", slots, [c], numbers) for c in (NoV, NoL)]
-            # l and v are in one plane, where h bisects them.
-            given = [NoV, NoL, np.cos((theta + light) / 2), np.cos((theta - light) / 2), *at]
-            curves[of.name] = _evaluate(sheet.device, f"MASKING_{function}", slots, given, numbers)
-            if of is sheet.entry:
-                want = of.reference[function](*given, **numbers["masking"])
-        axes.plot(np.degrees(theta), curves[rival.name], color=colour, linestyle=DASHED, linewidth=1.3)
-        axes.plot(np.degrees(theta), curves[sheet.entry.name], color=colour, label=rf"$\theta_l$ = {degrees}°")
-        axes.plot(np.degrees(theta)[17::36], want[17::36], "o", color="white", markeredgecolor=colour, markersize=5,
-                  zorder=4)
-    axes.plot([], [], color="0.3", linestyle=DASHED, linewidth=1.3, label=rival.name)
-    axes.plot([], [], "o", color="white", markeredgecolor="0.3", markersize=5, label="float64 reference")
-    _degrees(axes, -90, 90, 30, r"$\theta_v$ in the plane of l (degrees; + towards l)")
-    axes.set(ylabel=function, title=("Masking and shadowing, G" if function == "G" else "Visibility V = G / (n·l n·v)")
-             + f"; GGX, α = {alpha}")
-    if function == "G":
-        axes.set_ylim(0, 1.05)
-    else:
-        axes.set_yscale("log")
-        low, high = axes.get_ylim()
-        axes.set_ylim(min(max(low, 0.01), 0.8), max(min(high, 300), 3))
-        axes.set_yticks([t for t in (0.01, 0.03, 0.1, 0.3, 1, 3, 10, 30, 100, 300) if low <= t <= axes.get_ylim()[1]])
-        axes.set_yticklabels([f"{t:g}" for t in axes.get_yticks()])
-        axes.minorticks_off()
-        _legend(axes)
-
-
-def _energy(sheet: _Sheet, alpha: float, rival: Model, axes: Axes) -> None:
-    entry = sheet.entry
-    for what, of, colour, style, width, label in (("albedo", entry, BLUE, "-", 2.0, f"E, {entry.name}"),
-                                                  ("albedo", rival, BLUE, DASHED, 1.3, f"E, {rival.name}"),
-                                                  ("weak_furnace", entry, RED, "-", 2.0, "weak white furnace")):
-        if what == "albedo" or "MASKING_G1" in of.provides:
-            own = {f"masking_{name}": value for name, value in _own(of, alpha).items()}
-            values = integrate(what, ndf=FACETS, masking=of, NoV=COSINES, device=sheet.device, tolerance=TOLERANCE,
-                               ndf_alpha=alpha, **own).values
-            axes.plot(COSINES, values, color=colour, linestyle=style, linewidth=width, label=label)
-    axes.set(title=f"Energy, F = 1; GGX, α = {alpha}", ylabel="share of the energy")
-    axes.set_ylim(0, max(1.05, min(axes.get_ylim()[1], 3)))
-    _cosine_axis(axes)
-    _legend(axes)
-
-
-# ---------------------------------------------------------------------------------------------- Fresnel
-
-INCIDENCE = np.radians(np.linspace(0, 90, 721))
-
-
-def _fresnel_of(sheet: _Sheet, entry: Model, numbers: Numbers, theta: np.ndarray = INCIDENCE) -> np.ndarray:
-    return _evaluate(sheet.device, "FRESNEL_F", {"fresnel": entry}, [np.cos(theta)], {"fresnel": numbers})
-
-
-def _fresnel(sheet: _Sheet) -> Page:
-    """Curves over the angle for presets and for each parameter, Schlick against the exact curve, the error."""
-    entry = sheet.entry
-    presets = {name: _preset(entry, numbers) for name, numbers in entry.presets.items()}
-    metals = {name: n for name, n in presets.items() if any(np.ptp(v) > 0 for v in n.values())}
-    plain = {name: n for name, n in presets.items() if name not in metals}
-    panels: list[Callable[[Axes], None]] = []
-    for name, numbers in metals.items():
-        panels.append(partial(_metal, sheet, name, numbers))
-    if metals and plain:
-        panels.append(partial(_insulators, sheet, plain))
-    families = [f for f in sheet.families() if not metals]
-    for family in families:
-        below = [v for v in family.values if family.parameter is not None and family.parameter.name == "ior" and v < 1]
-        if below:
-            rest = tuple(v for v in family.values if v >= 1)
-            parts = [_Family(family.parameter, rest, family.held), _Family(family.parameter, tuple(below), family.held)]
-        else:
-            parts = [family]
-        for part in parts:
-            panels.append(partial(_angles, sheet, part))
-    if entry.name == SCHLICK:
-        panels.append(partial(_exact, sheet, False))
-        panels.append(partial(_exact, sheet, True))
-    elif families[0].parameter is not None:
-        panels.append(partial(_against_schlick, sheet))
-    if sheet.families()[0].parameter is not None:
-        panels.append(partial(_fresnel_error, sheet))
-    # Presets have their legends in free corners; curves of any shape have them beside.
-    columns, after = (3, 0.4) if metals else (2, 1.75)
-    rows = [panels[k:k + columns] for k in range(0, len(panels), columns)]
-    return [(3.3, [_Panel(paint, 4.2, 1.0 if metals and k == columns - 1 else after) for k, paint in enumerate(row)])
-            for row in rows]
-
-
-def _preset(entry: Model, numbers: Mapping[str, float | tuple[float, float, float]]) -> dict[str, np.ndarray]:
-    """Three of each parameter."""
-    defaults = {p.name: p.default for p in entry.parameters}
-    return {p.name: np.broadcast_to(np.asarray(numbers.get(p.name, defaults[p.name]), np.float64), 3)
-            for p in entry.parameters}
-
-
-def _metal(sheet: _Sheet, name: str, numbers: Numbers, axes: Axes) -> None:
-    F = _fresnel_of(sheet, sheet.entry, {k: v[:, None] for k, v in numbers.items()})
-    for values, (channel, colour), style in zip(F, RGB.items(), ("-", (0, (6, 2)), (0, (2, 1.5))), strict=True):
-        axes.plot(np.degrees(INCIDENCE), values, color=colour, label=channel, linestyle=style)
-    axes.set(title=name.replace("_", " "), ylim=(0, 1.03), ylabel="F")
-    _degrees(axes)
-    strip = axes.inset_axes([0, 0.0, 1, 0.06])  # what it looks like
-    even = np.stack([np.interp(np.linspace(0, math.pi / 2, 181), INCIDENCE, values) for values in F], -1)
-    srgb = np.where(even <= 0.0031308, 12.92 * even, 1.055 * np.maximum(even, 0) ** (1 / 2.4) - 0.055)
-    strip.imshow(np.clip(srgb, 0, 1)[None], aspect="auto")
-    strip.set(xticks=[], yticks=[])
-    for spine in strip.spines.values():
-        spine.set(visible=True, linewidth=0.6, color="0.7")
-    even = F[:, INCIDENCE <= math.radians(60)]
-    free = even.min() > 0.4  # below the curves, above the strip
-    if free or even.max() < 0.6:
-        _legend(axes, inside="center left" if even.min() > 0.7 else (0.02, 0.12) if free else "upper left")
-
-
-def _insulators(sheet: _Sheet, presets: Mapping[str, Mapping[str, np.ndarray]], axes: Axes) -> None:
-    together: dict[tuple[float, ...], list[str]] = {}
-    for name, numbers in presets.items():
-        together.setdefault(tuple(float(v[0]) for v in numbers.values()), []).append(name.replace("_", " "))
-    keys = sorted(together)
-    names = [p.name for p in sheet.entry.parameters]
-    for key, colour in zip(keys, _shades(len(keys)), strict=True):
-        F = _fresnel_of(sheet, sheet.entry, dict(zip(names, key, strict=True)))
-        axes.plot(np.degrees(INCIDENCE), F, color=colour, label=", ".join(together[key]))
-    axes.set(title="insulators", ylim=(0, 1.03), ylabel="F")
-    _degrees(axes)
-    _legend(axes, inside="upper left")
-
-
-def _angles(sheet: _Sheet, family: _Family, axes: Axes) -> None:
-    entry, p = sheet.entry, family.parameter
-    F = np.atleast_2d(_fresnel_of(sheet, entry, family.columns))
-    for values, colour, label in zip(F, _shades(len(F)), family.labels(entry), strict=True):
-        axes.plot(np.degrees(INCIDENCE), values, color=colour, label=label)
-    title = f"F by {_symbol(p)}" if p else "F"
-    if p is not None and p.name == "ior":
-        denser = family.values[-1] >= 1
-        for n, colour in zip(family.values, _shades(len(F)), strict=True):
-            if n != 1:
-                theta = np.array([math.atan(n) if denser else math.asin(n)])
-                axes.plot(np.degrees(theta), _fresnel_of(sheet, entry, {**family.held, p.name: n}, theta),
-                          "o" if denser else "D", color=colour, markeredgecolor="white", markersize=8, zorder=5)
-        axes.plot([], [], "o" if denser else "D", color="0.35", markeredgecolor="white", markersize=8,
-                  label="Brewster's\nangle, tan θ = n" if denser else "critical angle,\nsin θ = n")
-        title = "into the denser side, n ≥ 1" if denser else "into the thinner side, n < 1: total internal reflection"
-    axes.set(title=title, ylim=(min(0, float(F.min()) * 1.1), max(1.03, float(F.max()) * 1.02)), ylabel="F")
-    _degrees(axes)
-    _legend(axes, family.caption(entry))
-
-
-def _exact(sheet: _Sheet, difference: bool, axes: Axes) -> None:
-    """Schlick's curve beside the exact one of the insulator that has its f0."""
-    exact, usual = model("fresnel", EXACT), sheet.usual()
-    values = [f0 for f0 in sheet.values["f0"] if f0 < 0.4]
-    for f0, colour in zip(values, _shades(len(values)), strict=True):
-        root = math.sqrt(f0)
-        n = (1 + root) / (1 - root)
-        got = _fresnel_of(sheet, sheet.entry, {**usual, "f0": f0})
-        want = _fresnel_of(sheet, exact, {"ior": n})
-        label = rf"$\mathrm{{F}}_\mathrm{{0}}$ = {_number(f0)}, n = {n:.3g}"
-        if difference:
-            axes.plot(np.degrees(INCIDENCE), got - want, color=colour, label=label)
-        else:
-            axes.plot(np.degrees(INCIDENCE), got, color=colour, label=label)
-            axes.plot(np.degrees(INCIDENCE), want, color=colour, linestyle=(0, (3, 2)))
-    if difference:
-        axes.axhline(0, color="0.4", linewidth=1)
-        axes.set(title="Schlick less exact", ylabel="F − F exact")
-        axes.locator_params(axis="y", nbins=6)
-    else:
-        axes.plot([], [], color="0.3", linestyle=(0, (3, 2)), label="dashed: exact")
-        axes.set(title="Schlick and the exact insulator", ylim=(0, 1.03), ylabel="F")
-    _degrees(axes)
-    if not difference:
-        _legend(axes, inside="upper left")
-
-
-def _against_schlick(sheet: _Sheet, axes: Axes) -> None:
-    """What Schlick's curve of the same F(0°) would be off by."""
-    schlick = model("fresnel", SCHLICK)
-    family = sheet.families()[-1]
-    values = tuple(v for v in family.values if v >= 1) if family.parameter and family.parameter.name == "ior" \
-        else family.values
-    family = _Family(family.parameter, values, family.held)
-    F = _fresnel_of(sheet, sheet.entry, family.columns)
-    for curve, colour, label in zip(F, _shades(len(F)), family.labels(sheet.entry), strict=True):
-        if curve[0] < 1e-9:
-            continue  # no boundary
-        other = _fresnel_of(sheet, schlick, {"f0": float(np.clip(curve[0], 0, 1)), "f90": 1.0})
-        axes.plot(np.degrees(INCIDENCE), other - curve, color=colour, label=label)
-    axes.axhline(0, color="0.4", linewidth=1)
-    axes.set(title="Schlick of the same F(0°), less this", ylabel="F Schlick − F")
-    axes.locator_params(axis="y", nbins=6)
-    _degrees(axes)
-    _legend(axes, family.caption(sheet.entry))
-
-
-def _fresnel_error(sheet: _Sheet, axes: Axes) -> None:
-    family = sheet.families()[0]
-    cosine = _rounded(np.cos(np.radians(np.linspace(0, 90, 181))))
-
-    def error(values: np.ndarray) -> np.ndarray:
-        numbers = {k: _rounded(v) for k, v in family.numbers(values[:, None]).items()}
-        got = _evaluate(sheet.device, "FRESNEL_F", {"fresnel": sheet.entry}, [cosine], {"fresnel": numbers})
-        return np.abs(got - sheet.entry.reference["F"](cosine, **numbers))
-
-    _error_panel(sheet, family, axes, np.linspace(0, 90, 181), error, "Absolute error of F", False)
-    _degrees(axes)
-
-
-# ---------------------------------------------------------------------------------------------- diffuse and whole BRDFs
-
-
-def _diffuse(sheet: _Sheet) -> Page:
-    """E for each parameter with its reference, slices of f through the plane of v, the error."""
-    figure, entry, device = sheet.figure, sheet.entry, sheet.device
-    families = sheet.families()[::-1][:2]
-
-    def albedo(family: _Family, axes: Axes) -> None:
-        E = np.atleast_2d(integrate("albedo", diffuse=entry, NoV=COSINES, tolerance=TOLERANCE, device=device,
-                                    **family.columns).values)
-        for value, values, colour, label in zip(family.values, E, _shades(len(E)), family.labels(entry), strict=True):
-            axes.plot(COSINES, values, color=colour, label=label)
-            if "albedo" in entry.reference:
-                dots = COSINES[8::9]
-                want = np.broadcast_to(entry.reference["albedo"](dots, **family.numbers(value)), dots.shape)
-                axes.plot(dots, want, "o", color="white", markeredgecolor=colour, markersize=4.5)
-        if "albedo" in entry.reference:
-            axes.plot([], [], "o", color="white", markeredgecolor="0.3", markersize=4.5,
-                      label="float64\nreference")
-        axes.axhline(1, color="0.4", linewidth=1)
-        axes.set(title="Directional albedo" + (f" by {_symbol(family.parameter)}" if family.parameter else ""),
-                 ylabel="E", ylim=(0, float(np.clip(E.max() * 1.04, 1.05, 2.5))))
-        _cosine_axis(axes)
-        _legend(axes, family.caption(entry))
-
-    def error(axes: Axes) -> None:
-        theta = np.radians(np.linspace(-89.5, 89.5, 120))
-        light = [_rounded(c) for c in _towards(theta)]
-        view = [_rounded(c) for c in _towards(-np.radians(np.linspace(0.5, 89.5, 60))[:, None])]
-        numbers = {k: float(_rounded(v)) for k, v in sheet.usual().items()}
-        got = _evaluate(device, "DIFFUSE_F", {"diffuse": entry}, [*light, *view], {"diffuse": numbers})
-        wide = [np.stack(np.broadcast_arrays(*(np.broadcast_to(c, got.shape) for c in d)), -1) for d in (light, view)]
-        want = np.broadcast_to(entry.reference["f"](*wide, **numbers), got.shape)
-        off = np.abs(got - want) / np.abs(want)
-        _map(figure, axes, np.degrees(theta), np.linspace(0.5, 89.5, 60), off)
-        caption = ", ".join(f"{_symbol(p)} = {_number(numbers[p.name])}" for p in entry.parameters)
-        axes.set(ylabel=r"$\theta_v$ (degrees)", yticks=[0, 30, 60, 90])
-        axes.set_title(f"Relative error of f, {caption}: {_largest(off)}", fontsize=11)
-        _degrees(axes, -90, 90, 30, r"$\theta_l$ in the plane of v (degrees; − towards v)")
-
-    family = families[0]
-    shown = list(dict.fromkeys((family.values[min(1, len(family.values) - 1)], family.values[len(family.values) // 2],
-                                family.values[-1])))
-    curves = [_Panel(partial(albedo, f), 3.6, 1.5) for f in families]
-    slices = [_Panel(partial(_slices, sheet, family, v, v == shown[-1]), 4.6,
-                     1.5 if v == shown[-1] else 0.3, polar=(-90, 90)) for v in shown]
-    return [(3.4, [*curves, _Panel(error, 3.9, 0.9)]), (2.3, slices)]
-
-
-def _slices(sheet: _Sheet, family: _Family, value: float, legend: bool, axes: Axes) -> None:
-    theta = np.radians(np.linspace(-89.5, 89.5, 359))
-    numbers = family.numbers(value)
-    views = np.radians([0, 30, 60, 80])
-    f = math.pi * _evaluate(sheet.device, "DIFFUSE_F", {"diffuse": sheet.entry},
-                            [*_towards(theta), *_towards(-views[:, None])], {"diffuse": numbers})
-    top = float(np.clip(f.max() * 1.05, 0.2, 3))
-    if "albedo" in numbers:
-        axes.plot(theta, np.full_like(theta, numbers["albedo"]), color="0.55", linestyle=(0, (3, 2)), linewidth=1.3,
-                  label="Lambert")
-        top = max(top, numbers["albedo"] * 1.05)
-    for values, view, colour in zip(f, views, _shades(len(views)), strict=True):
-        axes.plot(theta, np.where((values >= 0) & (values <= top), values, np.nan), color=colour,
-                  label=rf"$\theta_v$ = {round(math.degrees(view))}°")
-        axes.plot([-view], [top], "v", color=colour, markersize=9, clip_on=False, zorder=6)
-    axes.set_ylim(0, top)
-    marks = [t for t in (0.5, 1, 1.5, 2, 2.5, 3) if t <= top]
-    axes.set_rgrids(marks, [f"{t:g}" for t in marks])
-    name = family.labels(sheet.entry)[0].split(" = ")[0]
-    # Above the half disc and the label of 0°.
-    axes.set_title(rf"π f over $\theta_l$, {name} = {_number(value)}   (▼ v)", y=0.75, pad=22)
-    if legend:
-        _legend(axes)
-
-
-def _brdf(sheet: _Sheet) -> Page:
-    """E in RGB, f in the plane of v, and f over all l for one v."""
-    from matplotlib.colors import LogNorm, Normalize
-
-    figure, entry, device, usual = sheet.figure, sheet.entry, sheet.device, sheet.usual()
-    caption = ", ".join(f"{k} = {_number(v)}" for k, v in usual.items())
-
-    def albedo(axes: Axes) -> None:
-        E = integrate("albedo", brdf=entry, NoV=COSINES, tolerance=TOLERANCE, device=device, **usual).values
-        styles = ("-", (0, (6, 2)), (0, (2, 1.5)))
-        for k, ((channel, colour), style) in enumerate(zip(RGB.items(), styles, strict=True)):
-            axes.plot(COSINES, E[:, k], color=colour, label=channel, linestyle=style)
-        axes.axhline(1, color="0.4", linewidth=1)
-        axes.set(title="Directional albedo" + (f", {caption}" if caption else ""), ylabel="E",
-                 ylim=(0, float(np.clip(E.max() * 1.05, 1.05, 4))))
-        _cosine_axis(axes)
-        _legend(axes)
-
-    def plane(axes: Axes) -> None:
-        theta, views = np.radians(np.linspace(-89.5, 89.5, 719)), np.radians([0, 30, 60, 80])
-        f = _evaluate(device, "BRDF_F", {"brdf": entry}, [*_towards(theta), *_towards(-views[:, None])],
-                      {"brdf": usual}).mean(0)
-        for values, view, colour in zip(f, views, _shades(4), strict=True):
-            axes.semilogy(np.degrees(theta), np.where(values > 0, values, np.nan), color=colour,
-                          label=rf"$\theta_v$ = {round(math.degrees(view))}°")
-        top = float(np.nanmax(f[np.isfinite(f)], initial=1e-3))
-        axes.set(title="f in the plane of v, mean of RGB", ylabel="f (1/sr)",
-                 ylim=(max(float(np.min(f[f > 0], initial=top)) / 2, top * 1e-8), top * 2))
-        _degrees(axes, -90, 90, 30, r"$\theta_l$ (degrees; − towards v)")
-        _legend(axes)
-
-    def disc(axes: Axes) -> None:
-        side = np.linspace(-1, 1, 301)
-        x, y = np.meshgrid(side, side)
-        inside = x * x + y * y < 0.9999
-        z = np.sqrt(np.maximum(1 - x * x - y * y, 1e-4))
-        view = _towards(-math.pi / 4)
-        f = _evaluate(device, "BRDF_F", {"brdf": entry}, [x, y, z, *view], {"brdf": usual}).mean(0)
-        shown = np.ma.masked_where(~inside | ~(f > 0), f)
-        low, top = float(shown.min()), float(shown.max())
-        norm = LogNorm(max(low, top * 1e-5), top) if top > 30 * low else Normalize(0, top)
-        mesh = axes.pcolormesh(side, side, shown, cmap="inferno", norm=norm, shading="nearest", rasterized=True)
-        axes.plot(*view[:2], "P", color="white", markeredgecolor="black", markersize=11)
-        axes.set(aspect="equal", title="f over l, seen from above; + v at 45°", xticks=[], yticks=[])
-        for spine in axes.spines.values():
-            spine.set_visible(False)
-        axes.grid(False)
-        _bar(figure, axes, mesh, "f (1/sr)")
-
-    return [(4.0, [_Panel(albedo, 4.0, 1.1), _Panel(plane, 4.8, 1.3), _Panel(disc, 4.0, 1.2)])]
-
-
-_FIGURES: dict[str, Callable[[_Sheet], Page]] = {
-    "ndf": _ndf, "masking": _masking, "fresnel": _fresnel, "diffuse": _diffuse, "brdf": _brdf,
-}

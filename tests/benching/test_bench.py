@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from whitefurnace import plot_style as plots
+from whitefurnace import plot_style
 from whitefurnace.benching import throughput as benching
 from whitefurnace.benching import tradeoff
+from whitefurnace.benching.figures import draw_tradeoff
 from whitefurnace.benching.throughput import CASES, FLOPS, Meter, Spread
 from whitefurnace.benching.tradeoff import Cost, Missed, Point
 from whitefurnace.cli import report
@@ -236,12 +237,12 @@ def test_text_and_json() -> None:
 
 
 def test_figure(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plots, "DPI", 40)
-    path = plots.draw_tradeoff(tmp_path / "a", POINTS, COSTS, device)
+    monkeypatch.setattr(plot_style, "DPI", 40)
+    path = draw_tradeoff(tmp_path / "a", POINTS, COSTS, device)
     assert path == tmp_path / "a/tradeoff.png" and path.read_bytes().startswith(b"\x89PNG")
     pixels = read_image(path).pixels
     assert len(np.unique(np.round(pixels.reshape(-1, pixels.shape[-1]), 3), axis=0)) > 20
-    assert plots.draw_tradeoff(tmp_path / "b", POINTS, COSTS, device).read_bytes() == path.read_bytes()
+    assert draw_tradeoff(tmp_path / "b", POINTS, COSTS, device).read_bytes() == path.read_bytes()
 
 
 def test_the_script_that_fills_the_readme(device: Device, meter: Meter) -> None:
@@ -296,7 +297,7 @@ def test_command_tradeoff(tmp_path: Path, light: np.ndarray, small: Callable[[],
 def small(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Fewer points: what the command does with them does not need more."""
     def shrink() -> None:
-        monkeypatch.setattr(plots, "DPI", 40)
+        monkeypatch.setattr(plot_style, "DPI", 40)
         monkeypatch.setattr(tradeoff, "TOLERANCES", (1e-2, 1e-3))
         monkeypatch.setattr(tradeoff, "SAMPLES", (32,))
         monkeypatch.setattr(tradeoff.costs, "__kwdefaults__", {

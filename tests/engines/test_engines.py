@@ -24,11 +24,13 @@ import pytest
 import reference
 from browser import Answer, PageError, chromium, glb, rendered
 from whitefurnace.engines.presets import ENGINES, Engine
+from whitefurnace.files import decode
+from whitefurnace.files.codec import encode
 from whitefurnace.files.containers import read_texture, write_texture
 from whitefurnace.files.env import EnvMap, read_env, write_env
 from whitefurnace.files.exr import write_exr
 from whitefurnace.files.png import write_png
-from whitefurnace.files.texture import encode, text_value
+from whitefurnace.files.texture import text_value
 from whitefurnace.prefiltering.reading import bilinear
 from whitefurnace.rendering.shading import irradiance, read_lights, shade, specular, split_sum
 from whitefurnace.sphere import harmonics as harmonic
@@ -352,7 +354,7 @@ def held(path: Path) -> Held:
         assert env.polynomials is not None
         return Held(list(env.levels), lambda n: babylon_at(env.polynomials, n))
     texture = read_texture(path)
-    levels = [texture.decode(k)[..., :3] for k in range(len(texture.levels))]
+    levels = [decode(texture, k)[..., :3] for k in range(len(texture.levels))]
     if "sh" not in texture.key_values:
         return Held(levels, None)
     rows = np.array(texture.key_values["sh"].rstrip(b"\0").decode().split(), float).reshape(9, 3)

@@ -17,7 +17,7 @@ from whitefurnace.cli import main, report
 from whitefurnace.engines.presets import ENGINES, FORMATS, Dfg, Engine, File, as_text, axes_matrix, engines, user_engine
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.expression import LANGUAGES, Expression, table_text
-from whitefurnace.files import encode, read_env, read_gltf_lights, read_image, read_texture
+from whitefurnace.files import decode, encode, read_env, read_gltf_lights, read_image, read_texture
 from whitefurnace.files.packing import step
 from whitefurnace.prefiltering.recipe import LOD_NAMES, Lods, chain
 from whitefurnace.sphere import harmonics as harmonic
@@ -174,7 +174,7 @@ def specular(name: str, folder: Path) -> tuple[list[np.ndarray], str]:
     if file.suffix == ".gltf":
         return list(read_gltf_lights(path)[0].levels), file.stored
     texture = read_texture(path)
-    return [texture.decode(k)[..., :3] for k in range(len(texture.levels))], texture.format
+    return [decode(texture, k)[..., :3] for k in range(len(texture.levels))], texture.format
 
 
 @pytest.mark.parametrize("name", [n for n in LOADED if ENGINES[n].holding("specular") and n != "khronos"])
@@ -256,10 +256,10 @@ def test_charlie_and_coverage(tmp_path, device):
     for ending in ("ggx", "charlie"):
         texture = read_texture(folder / f"array_{ending}.ktx2")
         for k in range(3):
-            assert texture.decode(k)[..., 3] == pytest.approx(0.25, abs=0.25 * (1e-2 + 2**-11)), "coverage is kept"
-    assert read_texture(folder / "array_lambertian.ktx2").decode(0).shape == (6, 32, 32, 4)
-    sheen = read_texture(folder / "array_charlie.ktx2").decode(2)[..., :3]
-    ggx = read_texture(folder / "array_ggx.ktx2").decode(2)[..., :3]
+            assert decode(texture, k)[..., 3] == pytest.approx(0.25, abs=0.25 * (1e-2 + 2**-11)), "coverage is kept"
+    assert decode(read_texture(folder / "array_lambertian.ktx2"), 0).shape == (6, 32, 32, 4)
+    sheen = decode(read_texture(folder / "array_charlie.ktx2"), 2)[..., :3]
+    ggx = decode(read_texture(folder / "array_ggx.ktx2"), 2)[..., :3]
     assert np.abs(sheen - ggx).max() > 0.02
 
 
@@ -338,7 +338,7 @@ def test_blocks(tmp_path, device):
     # [README, "What the numbers mean"]
     with np.load(tmp_path / "raw" / "array.npz") as archive:
         true = archive["specular_0"].astype(np.float64)
-    off = np.abs(texture.decode(0) - true) / np.maximum(true, 1e-3 * true.mean())
+    off = np.abs(decode(texture, 0) - true) / np.maximum(true, 1e-3 * true.mean())
     assert entry["levels"][0]["format_worst"] == pytest.approx(off.max(), rel=1e-3)
     # A block holds colours on two lines, which a gradient of all three channels leaves by up to 12 % where one is dark.
     assert 0.01 < entry["levels"][0]["format_worst"] < 0.5
@@ -383,7 +383,7 @@ def test_a_users_engine(tmp_path, device):
     assert [row["roughness"] for row in made.levels if "mine" in row["for"]] == pytest.approx([0, 0.5, 1])
     world = np.einsum("ji,...j->...i", np.array(axes_matrix("+x +z -y")), cube_directions(32))
     # Texel means of ½ + d/2 over faces of 32² from texels of .05 rad.
-    assert np.abs(texture.decode(0)[..., :3] - (1 + world) / 2).max() < 0.02
+    assert np.abs(decode(texture, 0)[..., :3] - (1 + world) / 2).max() < 0.02
     told = json.loads((folder / "array.json").read_text())
     assert list(told)[:2] == ["L00", "L1-1"]
     again = bake(coded(), tmp_path / "out", for_=f"raw,{path}", device=device)[0]
@@ -465,7 +465,7 @@ def test_octahedral_maps(tmp_path, device):
         s, b = place["size"], 2
         assert row["size"] == s and row["error"] <= (1e-3 if k else 2e-2)  # level 0 is of points
         image = atlas[place["row"] - b:place["row"] + s + b, place["column"] - b:place["column"] + s + b]
-        np.testing.assert_array_equal(octamap.strip_border(image, b), texture.decode(k)[..., :3])
+        np.testing.assert_array_equal(octamap.strip_border(image, b), decode(texture, k)[..., :3])
         read = octamap.read_bilinear(image, d, b)
         c = float(((2 * read - 1) * d.T).sum(1).mean())
         # Bilinear reads of a map of s² err by (2/s)² of the curvature, by half a texel at the creases' edges.

@@ -14,10 +14,10 @@ from whitefurnace.cli import main
 from whitefurnace.engines.presets import ENGINES
 from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.files import digest_file, write_exr, write_manifest, write_npz, write_texture
+from whitefurnace.files.codec import encode
 from whitefurnace.files.env import EnvMap, write_env
 from whitefurnace.files.gltf_lights import GltfLight, write_gltf_lights
 from whitefurnace.files.packing import step
-from whitefurnace.files.texture import encode
 from whitefurnace.inspection.comparison import axes_of, compare, percentile
 from whitefurnace.inspection.contents import contents
 from whitefurnace.sphere import harmonics as harmonic

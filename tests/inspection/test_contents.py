@@ -30,10 +30,11 @@ from whitefurnace.files import (
     write_npz,
     write_texture,
 )
+from whitefurnace.files.codec import encode
 from whitefurnace.files.env import EnvMap, write_env
 from whitefurnace.files.gltf_lights import GltfLight, write_gltf_lights
 from whitefurnace.files.packing import step
-from whitefurnace.files.texture import encode, text_value
+from whitefurnace.files.texture import text_value
 from whitefurnace.inspection.contents import contents, described, looks_like, statistics
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere.environments import LAYOUTS

@@ -18,10 +18,10 @@ import pytest
 import reference
 from whitefurnace import dfg, integrate, prefilter
 from whitefurnace.catalogue import INTEGRALS, Model, models
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.errors import CheckError, FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import CELLS_A_LAUNCH
-from whitefurnace.prefiltering.recipe import chosen
 
 # n·v from grazing to normal, the ends thicker and themselves.
 NOV = np.array([0, 1e-4, 1e-3, 0.01, 1 / 64, 0.05, 0.15, 0.4, 0.7, 0.9, 0.99, 0.9999, 1.0])

@@ -16,6 +16,7 @@ from whitefurnace.integrals.radiance import frame_of
 from whitefurnace.opencl import source
 from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import evaluate
+from whitefurnace.results import Integrated
 
 PRECISIONS = pytest.mark.parametrize("precision", [32, 64])
 OVERHEAD: dict[str, float] = {"center_x": 0, "center_y": 0, "center_z": 1}
@@ -24,7 +25,7 @@ SQUARE = {**OVERHEAD, "u_x": 1, "u_y": 0, "u_z": 0, "v_x": 0, "v_y": -1, "v_z": 
 
 @pytest.fixture
 def radiance(device: Device) -> Any:
-    def run(**arguments: Any) -> engine.Integrated:
+    def run(**arguments: Any) -> Integrated:
         if arguments.get("precision") == 64 and not device.fp64:
             pytest.skip("no float64")
         return integrate("radiance", device=device, **arguments)
@@ -241,7 +242,7 @@ def test_a_light_is_the_sum_of_its_parts(radiance: Any, precision: int, ndf: str
     u, v = rng.normal(size=(2, n, 3)) / 2
     v[(np.cross(u, v) * center).sum(1) > 0] *= -1
 
-    def lit(c: np.ndarray, u: np.ndarray, v: np.ndarray) -> engine.Integrated:
+    def lit(c: np.ndarray, u: np.ndarray, v: np.ndarray) -> Integrated:
         form = {f"{name}_{axis}": x[:, k] for name, x in (("center", c), ("u", u), ("v", v))
                 for k, axis in enumerate("xyz")}
         return radiance(light="rectangle", ndf=ndf, alpha=alpha, NoV=NoV, phi=phi, precision=precision, **form)

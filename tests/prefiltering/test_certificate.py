@@ -13,6 +13,7 @@ from scipy.stats import binom
 from test_statement import matrix, synthetic, texel_at
 
 from whitefurnace import prefilter
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.errors import UsageError
 from whitefurnace.opencl.device import Device
 from whitefurnace.prefiltering.certificate import CONFIDENCE, QUANTILE, rank, statement, texel_errors
@@ -20,7 +21,6 @@ from whitefurnace.prefiltering.convolution import Convolver
 from whitefurnace.prefiltering.lighting import Job, run_jobs
 from whitefurnace.prefiltering.lobes import ndf_lobe
 from whitefurnace.prefiltering.plan import LevelPlan, cuts_for, grid_size
-from whitefurnace.prefiltering.recipe import chosen
 from whitefurnace.sphere.environments import environment
 from whitefurnace.sphere.grids import Shape
 

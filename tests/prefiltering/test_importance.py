@@ -12,6 +12,7 @@ import pytest
 import reference
 from whitefurnace import irradiance, prefilter
 from whitefurnace.catalogue import Model, models
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.cli import main
 from whitefurnace.errors import UsageError
 from whitefurnace.files import write_exr
@@ -19,7 +20,7 @@ from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.importance import Sampler, light_samples
 from whitefurnace.prefiltering.lobes import COSINE, Lobe, mixture_lobe, ndf_lobe
 from whitefurnace.prefiltering.means import Means
-from whitefurnace.prefiltering.recipe import chain, chosen
+from whitefurnace.prefiltering.recipe import chain
 from whitefurnace.sphere.environments import cube_solid_angles, environment
 from whitefurnace.sphere.grids import Shape
 

@@ -13,10 +13,11 @@ from numpy.polynomial.chebyshev import chebval
 
 import reference
 from whitefurnace.catalogue import models
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.opencl.device import Device
 from whitefurnace.prefiltering.lobes import COSINE, MOST_TERMS, Lobe, Series, mixture_lobe, ndf_lobe
 from whitefurnace.prefiltering.plan import Part
-from whitefurnace.prefiltering.recipe import Chain, chain, chosen
+from whitefurnace.prefiltering.recipe import Chain, chain
 from whitefurnace.prefiltering.symmetry import Octahedral
 from whitefurnace.sphere.grids import Shape
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from whitefurnace.catalogue import models
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.lobes import COSINE, Lobe, ndf_lobe
 from whitefurnace.prefiltering.plan import Part, Window
-from whitefurnace.prefiltering.recipe import chosen
 from whitefurnace.prefiltering.symmetry import RUN, TILE, Octahedral, Orbits, orbits, tile_bounds
 from whitefurnace.sphere.grids import Shape, grid_tangents
 

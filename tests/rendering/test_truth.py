@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from whitefurnace import bake, integrate
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.cli import cli
 from whitefurnace.errors import InputError, UsageError
 from whitefurnace.files import read_image, read_stored, write_exr
 from whitefurnace.opencl.device import Device
-from whitefurnace.prefiltering.recipe import chosen
 from whitefurnace.rendering import side_by_side as beside
 from whitefurnace.rendering.side_by_side import Material, Spheres, in_frame
 from whitefurnace.rendering.truth import LIGHTS, Points, Truth, albedo, blocks, cut, term

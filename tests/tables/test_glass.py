@@ -10,9 +10,9 @@ import pytest
 import reference
 from whitefurnace import integrate, lut
 from whitefurnace.catalogue import model
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.opencl.device import Device
-from whitefurnace.prefiltering.recipe import chosen
 from whitefurnace.tables.glass import glass
 
 

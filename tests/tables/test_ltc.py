@@ -12,10 +12,10 @@ from click.testing import CliRunner
 
 import reference
 from whitefurnace import lut
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.cli import cli
 from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.opencl.device import Device
-from whitefurnace.prefiltering.recipe import chosen
 from whitefurnace.tables import ltc
 from whitefurnace.tables import lut as tables
 

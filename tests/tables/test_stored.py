@@ -13,7 +13,7 @@ import pytest
 
 from whitefurnace import lut
 from whitefurnace.errors import UnsupportedError, UsageError
-from whitefurnace.files import read_texture
+from whitefurnace.files import decode, read_texture
 from whitefurnace.files.tables import identifier, write_table
 from whitefurnace.opencl.device import Device
 
@@ -33,7 +33,7 @@ def read(path: Path) -> np.ndarray:
         shape = [int(n) for n in re.findall(r"\[(\d+)\]", text)]
         numbers = re.findall(r"-?[\d.]+(?:e[-+]\d+)?(?=f\b)", text.split("= {\n")[1])
         return np.array(numbers, np.float32).reshape(shape)
-    return np.asarray(read_texture(path).decode(0))
+    return np.asarray(decode(read_texture(path), 0))
 
 
 @pytest.mark.parametrize("name, stored", [("t.png", None), ("t.png", "r8"), ("t.ktx2", None), ("t.ktx2", "rgba16f"),

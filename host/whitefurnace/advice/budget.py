@@ -26,7 +26,7 @@ from whitefurnace.baking.outputs import targets
 from whitefurnace.catalogue import models
 from whitefurnace.engines.presets import ENGINES, FORMATS, Dfg, Engine, File, reduced
 from whitefurnace.errors import CheckError, InputError, UnsupportedError, UsageError
-from whitefurnace.files import encode, pack, unpack
+from whitefurnace.files import decode, encode, pack, unpack
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.certificate import texel_errors
 from whitefurnace.prefiltering.level_fit import read_mixtures
@@ -838,7 +838,7 @@ def kept(levels: Sequence[np.ndarray], form: str, *, cube: bool = True) -> list[
         return list(levels)
     if form in ("bc6hu", "astc4x4hdr"):
         made = encode(form, levels, cube=cube).texture
-        return [made.decode(k)[..., :3] for k in range(len(levels))]
+        return [decode(made, k)[..., :3] for k in range(len(levels))]
     if form == "rgba16f":
         return [stored(level, "float16") for level in levels]
     return [unpack(form, pack(form, level).data, level.shape[:-1])[..., :level.shape[-1]] for level in levels]

@@ -15,11 +15,12 @@ import numpy as np
 from whitefurnace.baking.bake import DEMO
 from whitefurnace.baking.outputs import targets
 from whitefurnace.batch.jobs import SECONDS
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.engines.presets import Engine, reduced
 from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import write_text
 from whitefurnace.prefiltering.plan import plan_chain
-from whitefurnace.prefiltering.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain, chosen
+from whitefurnace.prefiltering.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain
 from whitefurnace.rendering.shading import SHADINGS, karis
 from whitefurnace.scenes.materials import Material, Scene, Spread
 

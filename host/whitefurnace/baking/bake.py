@@ -17,6 +17,7 @@ import numpy as np
 
 from whitefurnace.baking.outputs import Made, Target, targets
 from whitefurnace.baking.programs import Program, programs
+from whitefurnace.catalogue.choice import Chosen, chosen, is_number
 from whitefurnace.engines.presets import Engine, engines, reduced
 from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError
 from whitefurnace.files import (
@@ -31,23 +32,15 @@ from whitefurnace.files import (
     read_manifest,
     write_manifest,
 )
-from whitefurnace.integrals.quadrature import Integrated, dfg
+from whitefurnace.integrals.quadrature import dfg
 from whitefurnace.opencl import source
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.convolution import Level
 from whitefurnace.prefiltering.lighting import Filtered, Lighting, Want, light
 from whitefurnace.prefiltering.plan import LevelPlan, plan_chain
 from whitefurnace.prefiltering.reading import Reader, compared
-from whitefurnace.prefiltering.recipe import (
-    DFG_SIZE,
-    IRRADIANCE_SIZE,
-    TOLERANCE_RANGE,
-    Chain,
-    Chosen,
-    chain,
-    chosen,
-    is_number,
-)
+from whitefurnace.prefiltering.recipe import DFG_SIZE, IRRADIANCE_SIZE, TOLERANCE_RANGE, Chain, chain
+from whitefurnace.results import Integrated
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere.environments import Environment, check_options, environment, source_digest
 from whitefurnace.sphere.grids import Shape

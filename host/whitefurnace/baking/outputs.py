@@ -17,6 +17,7 @@ from whitefurnace.files import (
     GltfLight,
     Texture,
     Transaction,
+    decode,
     encode,
     pack,
     pack_hdr,
@@ -32,11 +33,11 @@ from whitefurnace.files import (
     write_png,
     write_texture,
 )
-from whitefurnace.integrals.quadrature import Integrated
 from whitefurnace.prefiltering.certificate import texel_errors
 from whitefurnace.prefiltering.convolution import Level
 from whitefurnace.prefiltering.lighting import Filtered, Lighting
 from whitefurnace.prefiltering.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain
+from whitefurnace.results import Integrated
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere.grids import turned_cube
 from whitefurnace.sphere.octahedral_map import to_atlas
@@ -129,7 +130,7 @@ def _texture(engine: Engine, path: Path, file: File, levels: Sequence[Level], ma
     if path.suffix == ".dds":
         keys = {}  # has no place for them
     encoded = encode(file.stored, held, cube=True, key_values=keys)
-    back = [encoded.texture.decode(k) for k in range(len(levels))]
+    back = [decode(encoded.texture, k) for k in range(len(levels))]
     told = {"holds": file.holds, "format": file.stored, **_clipped(encoded.clipped),
             "levels": [_level_told(*one) for one in zip(levels, back, turned, strict=True)]}
     inverse = np.array(engine.matrix).T
@@ -215,7 +216,7 @@ def _octahedral(engine: Engine, path: Path, file: File, made: Made) -> Target:
     keys = {} if path.suffix == ".dds" else _keys(engine, made, [level.error for level in levels])
     encoded = encode(file.stored, maps, key_values=keys)
     told |= _clipped(encoded.clipped)
-    told["levels"] = [_level_told(level, encoded.texture.decode(k), level.texels) for k, level in enumerate(levels)]
+    told["levels"] = [_level_told(level, decode(encoded.texture, k), level.texels) for k, level in enumerate(levels)]
     return Target(path, engine.name, _size(encoded.texture),
                   lambda t: write_texture(path, encoded.texture, zstd=file.zstd, into=t), told)
 
@@ -324,7 +325,7 @@ def _dfg(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None
         return Target(path, engine.name, packed.data.nbytes, lambda t: write_png(path, packed.data, into=t), told)
     keys = _keys(engine, made, [made.split.error])
     encoded = encode(file.stored, [wide], key_values={} if file.suffix == ".dds" else keys)
-    told["format_worst"] = float(np.abs(encoded.texture.decode(0)[..., :channels] - values).max())
+    told["format_worst"] = float(np.abs(decode(encoded.texture, 0)[..., :channels] - values).max())
     return Target(path, engine.name, _size(encoded.texture),
                   lambda t: write_texture(path, encoded.texture, zstd=file.zstd, into=t), told)
 

@@ -17,10 +17,10 @@ from urllib.parse import quote
 
 from whitefurnace.baking.bake import format_notices
 from whitefurnace.batch.jobs import Result
-from whitefurnace.cli.report import size as bytes_text
 from whitefurnace.errors import FileError, WhitefurnaceError
 from whitefurnace.files import read_manifest, write_atomic
 from whitefurnace.rendering.thumbnails import CELL, LOOK, read_strip, write_strip
+from whitefurnace.text import size as bytes_text
 
 INDEX, STRIPS = "index.html", "strips"
 OURS = b'<meta name="generator" content="whitefurnace">'

@@ -21,9 +21,10 @@ import tomllib
 
 from whitefurnace.baking import bake as baking
 from whitefurnace.batch import pool
+from whitefurnace.catalogue.choice import file_of
 from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, nearest
 from whitefurnace.files import digest_file, is_lock, is_safe, locks_in, write_text
-from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE, file_of
+from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
 from whitefurnace.sphere.environments import extent, source_files
 from whitefurnace.tables import lut as tables
 

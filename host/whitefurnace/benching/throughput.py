@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import integral, model
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.catalogue.rule import AREA_RULES, LADDERS, Rule
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.opencl import source
@@ -23,7 +24,6 @@ from whitefurnace.prefiltering.convolution import HARMONICS_CHUNK, Convolver
 from whitefurnace.prefiltering.importance import Sampler
 from whitefurnace.prefiltering.lobes import Lobe, ndf_lobe
 from whitefurnace.prefiltering.means import Means
-from whitefurnace.prefiltering.recipe import chosen
 from whitefurnace.prefiltering.sources import Texels
 from whitefurnace.prefiltering.symmetry import Octahedral
 from whitefurnace.rendering.truth import Points, Term, Truth, term

@@ -573,9 +573,9 @@ def verify(specs: tuple[str, ...], precision: int | None, folder: Path | None, d
                     click.echo(report.VERIFY_HEAD)
                 click.echo(report.verify_text(shown))
     if folder is not None:
-        from whitefurnace import plot_style as plots
+        from whitefurnace.verification.figures import draw
 
-        for path in plots.draw(folder, [subject.model for subject in subjects], rows, on):
+        for path in draw(folder, [subject.model for subject in subjects], rows, on):
             if as_json:
                 _json({"event": "plot", "file": str(path)})
             elif not quiet:
@@ -709,9 +709,9 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
     else:
         _json({"event": "device", "device": said})
     if folder is not None:
-        from whitefurnace import plot_style as plots
+        from whitefurnace.benching.figures import draw_tradeoff
 
-        path = plots.draw_tradeoff(folder, points, measured, on)
+        path = draw_tradeoff(folder, points, measured, on)
         if as_json:
             _json({"event": "plot", "file": str(path)})
         else:
@@ -883,9 +883,9 @@ def compare(a: Path, b: Path, max_error: float | None, axes_a: str | None, axes_
     if not as_json:
         click.echo(report.compared_text(found))
     if folder is not None:
-        from whitefurnace import plot_style as plots
+        from whitefurnace.inspection.figures import draw_comparison
 
-        path = plots.draw_comparison(folder, found)
+        path = draw_comparison(folder, found)
         if as_json:
             _json({"event": "plot", "file": str(path)})
         else:
@@ -964,10 +964,10 @@ def engines(name: str | None, as_toml: bool, as_json: bool) -> None:
 
 def _plots_into(folder: Path) -> None:
     """Makes the folder for plots, and finds matplotlib missing, before the work and not after it."""
-    from whitefurnace import plot_style as plots
+    from whitefurnace import plot_style
     from whitefurnace.errors import FileError
 
-    plots.require()
+    plot_style.require()
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

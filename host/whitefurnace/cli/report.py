@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from whitefurnace.catalogue.bibliography import PAPERS
+from whitefurnace.text import size, table
 
 if TYPE_CHECKING:
     from whitefurnace.advice.budget import Budget, Choice, Entry
@@ -26,26 +27,6 @@ if TYPE_CHECKING:
     from whitefurnace.scenes.media import Inside, Pixel
     from whitefurnace.tables.lut import Table
     from whitefurnace.verification.checks import Row
-
-
-def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A plain table with aligned columns; the first `left` of them to the left, the rest to the right."""
-    cells = [list(head), *[list(row) for row in rows]]
-    widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
-    lines = []
-    for row in cells:
-        parts = [c.ljust(w) if k < left else c.rjust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))]
-        lines.append("  " + "  ".join(parts).rstrip())
-    return "\n".join(lines)
-
-
-def size(nbytes: float) -> str:
-    """Bytes for people."""
-    for unit in ("B", "KB", "MB"):
-        if nbytes < 1000:
-            return f"{nbytes:.0f} {unit}" if unit == "B" else f"{nbytes:.3g} {unit}"
-        nbytes /= 1000
-    return f"{nbytes:.3g} GB"
 
 
 def baked_text(baked: Baked, output: Path) -> str:

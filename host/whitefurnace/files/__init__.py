@@ -3,6 +3,7 @@ first needed: it takes longer to load than `--help` may."""
 
 from whitefurnace.files.arrays import is_arrays, read_header, read_npy, read_npz
 from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
+from whitefurnace.files.codec import decode, encode
 from whitefurnace.files.containers import is_texture, read_texture, write_texture
 from whitefurnace.files.env import EnvMap, read_env, write_env
 from whitefurnace.files.exr import write_exr
@@ -20,7 +21,7 @@ from whitefurnace.files.packing import pack, unpack
 from whitefurnace.files.png import write_png
 from whitefurnace.files.stored import ImageFacts, image_facts, read_rgbd, read_stored
 from whitefurnace.files.tables import Stored, check_table, identifier, number, stored_format, write_table, write_text
-from whitefurnace.files.texture import Texture, encode, text_value
+from whitefurnace.files.texture import Texture, text_value
 
 __all__ = [
     "EnvMap",
@@ -36,6 +37,7 @@ __all__ = [
     "acquire",
     "after_death",
     "check_table",
+    "decode",
     "decode_srgb",
     "digest_file",
     "encode",

@@ -20,6 +20,7 @@ from whitefurnace.errors import InputError, UnsupportedError
 from whitefurnace.files import ktx1, ktx2
 from whitefurnace.files.atomic import digest_file
 from whitefurnace.files.binary import Source, load
+from whitefurnace.files.codec import decode
 from whitefurnace.files.containers import is_texture, parse_texture
 from whitefurnace.files.env import MAGIC as ENV_MAGIC
 from whitefurnace.files.env import parse_env
@@ -87,7 +88,7 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
     levels: tuple[Texels, ...] = ()
     undecoded = ""
     try:
-        levels = tuple(upright(texture.decode(k), texture.orientation)
+        levels = tuple(upright(decode(texture, k), texture.orientation)
                        for k in range(1 if first else len(texture.levels)))
     except UnsupportedError as error:
         undecoded = str(error)

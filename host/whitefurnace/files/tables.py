@@ -14,10 +14,11 @@ import numpy.typing as npt
 
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
 from whitefurnace.files.atomic import Transaction, write_pieces
+from whitefurnace.files.codec import decode, encode
 from whitefurnace.files.containers import write_texture
 from whitefurnace.files.packing import FORMATS
 from whitefurnace.files.png import MAX_SIDE, encode_png
-from whitefurnace.files.texture import MAX_LAYERS, encode, text_value
+from whitefurnace.files.texture import MAX_LAYERS, text_value
 
 STORED: Mapping[str, Sequence[str]] = {
     ".png": ("r16", "r8"),
@@ -108,7 +109,7 @@ def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str
     keys = {name: text_value(text) for name, text in (texts or {}).items()} if suffix == ".ktx2" else {}
     texture = encode(form, [_widened(np.ascontiguousarray(cells), FORMATS[form].channels, 1)], key_values=keys).texture
     write_texture(path, texture, zstd=ZSTD if suffix == ".ktx2" else None, into=into)
-    back = texture.decode(0)[..., :cells.shape[-1]].astype(np.float64)
+    back = decode(texture, 0)[..., :cells.shape[-1]].astype(np.float64)
     return Stored(form, float(np.abs(back - cells).max()))
 
 

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.files.binary import MAX_BYTES, Buffer, Source
-from whitefurnace.files.packing import FORMATS, Packed, format_named, pack, unpack
+from whitefurnace.files.packing import FORMATS, format_named
 
 MAX_SIDE = 65536
 MAX_LAYERS = 2048  # of Direct3D 11 and, at least, of Vulkan
-BC6H = ("bc6hu", "bc6hs")
-ASTC = "astc4x4hdr"
 
 
 @dataclass(frozen=True)
@@ -55,21 +53,6 @@ class Texture:
     def level_bytes(self, k: int) -> int:
         return level_bytes(self.format, self.width, self.height, k) * max(self.layers, 1) * self.faces
 
-    def decode(self, k: int) -> npt.NDArray[np.float32]:
-        """Level k as a GPU reads it: float32 ([layers,] [6,] height, width, channels). Raises `UnsupportedError` for
-        ASTC without astc-encoder-py."""
-        width, height = self.extent(k)
-        shape = (*([self.layers] if self.layers else []), *([6] if self.cube else []), height, width)
-        if self.format in BC6H:
-            from whitefurnace.files.bc6h import decode_bc6h  # which makes textures
-
-            return decode_bc6h(self.format, memoryview(self.levels[k]), shape)
-        if self.format == ASTC:
-            from whitefurnace.files.astc import decode_astc  # loaded when needed
-
-            return decode_astc(memoryview(self.levels[k]), shape)
-        return unpack(self.format, memoryview(self.levels[k]), shape)
-
 
 def upright(texels: npt.NDArray[np.float32], orientation: str) -> npt.NDArray[np.float32]:
     """Texels (..., height, width, channels) of a texture of that orientation with their rows from the top and each row
@@ -77,59 +60,6 @@ def upright(texels: npt.NDArray[np.float32], orientation: str) -> npt.NDArray[np
     if "u" in orientation:
         texels = texels[..., ::-1, :, :]
     return texels[..., ::-1, :] if "l" in orientation else texels
-
-
-@dataclass(frozen=True)
-class Encoded:
-    """A texture made of floats, and per level how many values were `clipped` and how many `negative` became 0."""
-
-    texture: Texture
-    clipped: tuple[int, ...]
-    negative: tuple[int, ...]
-
-
-def encode(
-    form: str,
-    levels: Sequence[npt.ArrayLike],
-    *,
-    cube: bool = False,
-    key_values: Mapping[str, bytes] | None = None,
-    orientation: str = "rd",
-) -> Encoded:
-    """A texture of the format `form` from `levels` of floats, each ([layers,] [6,] height, width, channels); the 6 are
-    there exactly where `cube` is true. Raises `InputError` for NaN, `UnsupportedError` for signed BC6H, which is not
-    encoded, for `bc6hu` without ispc-texcomp and for `astc4x4hdr` without astc-encoder-py."""
-    arrays = [np.asarray(level) for level in levels]
-    if not arrays:
-        raise ValueError("a texture has at least one level")
-    axes = 4 if cube else 3
-    first = arrays[0]
-    if first.ndim not in (axes, axes + 1) or (cube and first.shape[-4] != 6):
-        six = "6, " if cube else ""
-        raise ValueError(f"levels of shape {first.shape} are not ([layers,] {six}height, width, channels)")
-    height, width = first.shape[-3:-1]
-    packed = []
-    for k, array in enumerate(arrays):
-        if array.shape[:-3] != first.shape[:-3] or array.shape[-3:-1] != (max(height >> k, 1), max(width >> k, 1)):
-            raise ValueError(f"level {k} of shape {array.shape} does not follow level 0 of shape {first.shape}")
-        packed.append(_pack(form, array))
-    texture = Texture(
-        form, width, height, tuple(p.data.tobytes() for p in packed), first.shape[0] if first.ndim > axes else 0,
-        6 if cube else 1, dict(key_values or {}), orientation,
-    )
-    return Encoded(texture, tuple(p.clipped for p in packed), tuple(p.negative for p in packed))
-
-
-def _pack(form: str, array: npt.NDArray[np.generic]) -> Packed:
-    if form == "bc6hu":
-        from whitefurnace.files.bc6h import encode_bc6h  # which makes textures
-
-        return encode_bc6h(array)
-    if form == ASTC:
-        from whitefurnace.files.astc import encode_astc
-
-        return encode_astc(array)
-    return pack(form, array)
 
 
 def text_value(text: str) -> bytes:

@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from whitefurnace.catalogue.choice import Spec
 from whitefurnace.errors import UsageError
 from whitefurnace.integrals import quadrature as run
-from whitefurnace.integrals.quadrature import Integrated, Progress
+from whitefurnace.integrals.quadrature import Progress
 from whitefurnace.opencl.device import Device
-from whitefurnace.prefiltering.recipe import Spec
+from whitefurnace.results import Integrated
 
 if TYPE_CHECKING:
     from whitefurnace.sphere.environments import Environment

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import Model
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.opencl.derived import finest, numbers_of, refuse_bad
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.opencl.launch import evaluate
-from whitefurnace.prefiltering.recipe import chosen
 
 QUANTILES = 4096
 """Intervals of a tabulated quantile, between which the density is taken as constant in the graded angle: with 12

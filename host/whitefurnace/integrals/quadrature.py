@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import Integral, Model, integral, model
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
 from whitefurnace.catalogue.registry import CLOSED
 from whitefurnace.catalogue.rule import AVERAGE_RULES, LADDERS, Rule, gauss
 from whitefurnace.errors import CheckError, UnsupportedError, UsageError, nearest
@@ -16,7 +17,7 @@ from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import Areas, numbers_of
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.opencl.launch import CELLS_A_LAUNCH, over_nodes
-from whitefurnace.prefiltering.recipe import Chosen, Spec, chosen, is_number
+from whitefurnace.results import Integrated
 
 DEFAULT_TOLERANCE = {32: 1e-6, 64: 1e-12}
 BACKFACING = ("clamp", "absolute")
@@ -40,27 +41,6 @@ UNFINISHED = 3
 nodes, as kinks leave it, falls by 1.4 a rule, and 1/1.4 + 1/1.4² + … is 2.5."""
 
 Progress = Callable[[float], None]
-
-
-@dataclass(frozen=True)
-class Integrated:
-    """The result of `integrate`.
-
-    `values` has the broadcast shape of the parameters, with a trailing axis for a vector integral; `error` is
-    the estimated absolute error, the largest over all cells; `rule` names the finest rule that was used and
-    `evaluations` counts its integrand evaluations, all cells together; `seconds` is the wall time; `notices` say
-    what was done that was not asked for, such as cells taken to float64.
-    """
-
-    values: np.ndarray
-    error: float
-    evaluations: int
-    seconds: float
-    rule: str
-    notices: tuple[str, ...] = field(default=())
-
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        return np.array(self.values, dtype=dtype) if dtype or copy else self.values
 
 
 def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import Integral, Model, integral
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
 from whitefurnace.catalogue.rule import Rule, gauss
 from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.integrals.outlines import outline, panels
@@ -19,7 +20,6 @@ from whitefurnace.integrals.quadrature import (
     ROUNDING,
     Demand,
     Grid,
-    Integrated,
     Part,
     Progress,
     Tally,
@@ -34,7 +34,7 @@ from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import finest, unique_rows
 from whitefurnace.opencl.device import Buffer, Device, choose_device
 from whitefurnace.opencl.launch import evaluate, over_nodes
-from whitefurnace.prefiltering.recipe import Chosen, Spec, chosen, is_number
+from whitefurnace.results import Integrated
 from whitefurnace.sphere.environments import Environment, environment
 from whitefurnace.sphere.grids import composite, cube_directions, cube_tables, latlong_tables
 

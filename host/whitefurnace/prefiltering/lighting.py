@@ -13,7 +13,6 @@ import numpy as np
 
 from whitefurnace.catalogue import Model
 from whitefurnace.errors import CheckError, UsageError
-from whitefurnace.integrals.quadrature import Integrated
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering import plan as planning
 from whitefurnace.prefiltering.certificate import statement, texel_errors
@@ -23,6 +22,7 @@ from whitefurnace.prefiltering.level_fit import read_mixtures
 from whitefurnace.prefiltering.lobes import COSINE, Lobe, mixture_lobe, ndf_lobe
 from whitefurnace.prefiltering.plan import LevelPlan
 from whitefurnace.prefiltering.recipe import CERTIFIED, IRRADIANCE_SIZE, Chain, chain, samples_of, tolerance_of
+from whitefurnace.results import Integrated
 from whitefurnace.sphere.environments import Environment, environment
 from whitefurnace.sphere.grids import POINTS, Shape, source_solid_angles
 

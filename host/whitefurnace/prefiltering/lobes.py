@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import Model
+from whitefurnace.catalogue.choice import Chosen
 from whitefurnace.opencl.derived import at_horizon, density_at, lobe_norm, numbers_of
 from whitefurnace.opencl.device import Device
-from whitefurnace.prefiltering.recipe import Chosen
 
 NODES = 64
 """Chebyshev nodes at which a series is fitted; it keeps at most MOST_TERMS of as many terms."""

@@ -9,13 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from whitefurnace.prefiltering.recipe import Chain
-
-ORDER = 8
-"""Points of the Lagrange stencil of the anterpolated grids, as in `anterpolate.cl`. At 1e-3 a sharp lobe needs two
-fifths of the nodes that it needs with 4 points, at 2e-5 a quarter."""
-
-BEYOND = 4
-"""Nodes of a grid past each edge of a face, as there."""
+from whitefurnace.sphere.grids import BEYOND
 
 PATCH = 16
 """Gaps an edge of the blocks in which texels are anterpolated; as in `anterpolate.cl`."""

@@ -12,6 +12,7 @@ from whitefurnace.opencl import source
 from whitefurnace.opencl.device import Buffer, Device, Kernel
 from whitefurnace.prefiltering import plan as planning
 from whitefurnace.prefiltering.lobes import Lobe
+from whitefurnace.sphere import grids
 from whitefurnace.sphere.environments import Environment, channel_range
 from whitefurnace.sphere.grids import (
     coarsening,
@@ -219,7 +220,7 @@ class Texels:
             cuts = self.cuts if self.cuts > 1 or self.centred else 2
             grid = self.device.empty((6, n, n, 4), self.kind)
             blocks = -(-(n - 1) // planning.PATCH)
-            reached = (planning.PATCH + planning.ORDER - 1) ** 2 * 4
+            reached = (planning.PATCH + grids.ORDER - 1) ** 2 * 4
             faces = next(f for f in (6, 3, 2, 1) if f == 1 or f * blocks**2 * reached <= PATCHES)
             patches = self.device.empty((faces, blocks**2, reached), self.kind)
             for face in range(0, 6, faces):

@@ -14,6 +14,7 @@ import numpy as np
 from whitefurnace.engines.presets import Engine, File, engine_of_data, engines
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.files import (
+    decode,
     digest_file,
     read_env,
     read_gltf_lights,
@@ -303,7 +304,7 @@ def _texels(path: Path, *, cube: bool) -> tuple[np.ndarray, ...]:
     texture = read_texture(path)
     if texture.cube != cube or texture.layers:
         raise InputError(f"{path} is not a single {'cube' if cube else '2-D image'}")
-    levels = tuple(upright(texture.decode(k), texture.orientation) for k in range(len(texture.levels)))
+    levels = tuple(upright(decode(texture, k), texture.orientation) for k in range(len(texture.levels)))
     if cube and levels[0].shape[-1] < 3:
         raise InputError(f"{path} has {levels[0].shape[-1]} channels, radiance has 3")
     return tuple(level[..., :3] for level in levels) if cube else levels

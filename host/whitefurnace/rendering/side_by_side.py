@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.baking.bake import demo
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen
 from whitefurnace.engines.presets import Engine
 from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import read_manifest, write_exr
@@ -21,7 +22,6 @@ from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.certificate import texel_errors
 from whitefurnace.prefiltering.lighting import irradiance
 from whitefurnace.prefiltering.reading import bilinear
-from whitefurnace.prefiltering.recipe import Chosen, Spec, chosen
 from whitefurnace.rendering import shading as rendering
 from whitefurnace.rendering.shading import Lights
 from whitefurnace.rendering.truth import Points, Term, Truth, albedo, term
@@ -446,9 +446,10 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
     if output.exists() and not force:
         raise FileError(f"{output} exists; --force replaces it")
     if output.suffix.lower() == ".png":
-        from whitefurnace import plot_style as plots
+        from whitefurnace import plot_style
+        from whitefurnace.rendering.figures import draw_beside
 
-        plots.require()
+        plot_style.require()
     engine, folder, stem = rendering.engine_in(manifest, for_)
     lights = rendering.read_lights(engine, folder, stem)
     for name, spec in (("dielectric", dielectric), ("metal", metal)):
@@ -479,7 +480,7 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         write_exr(output, np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
                   channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"), attributes=_stated(made))
     else:
-        plots.draw_beside(output, [rendering.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
+        draw_beside(output, [rendering.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
                          np.where(shown.covered, shown.luminance, np.nan), scale, engine.name, _caption(made),
                          {key: str(value) for key, value in _stated(made).items()})
     return made

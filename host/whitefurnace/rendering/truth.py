@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import integral
+from whitefurnace.catalogue.choice import Chosen, Spec
 from whitefurnace.errors import UnsupportedError
 from whitefurnace.integrals.normals import quantiles
 from whitefurnace.integrals.quadrature import Part, grid_of, integrate, rows_of_roughness, slots_of
@@ -26,7 +27,6 @@ from whitefurnace.opencl.launch import evaluate
 from whitefurnace.prefiltering.certificate import QUANTILE, texel_errors
 from whitefurnace.prefiltering.importance import CHUNK, GOLDEN, LARGEST_SOURCE, SAMPLES_A_LAUNCH, Sampler
 from whitefurnace.prefiltering.means import Means
-from whitefurnace.prefiltering.recipe import Chosen, Spec
 from whitefurnace.sphere.environments import Environment
 from whitefurnace.sphere.grids import (
     cube_directions,

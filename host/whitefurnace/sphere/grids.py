@@ -10,8 +10,14 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue.rule import gauss
-from whitefurnace.prefiltering import plan as planning
 from whitefurnace.sphere.environments import Environment, cube_solid_angles, latlong_solid_angles
+
+ORDER = 8
+"""Points of the Lagrange stencil of the anterpolated grids, as in `anterpolate.cl`. At 1e-3 a sharp lobe needs two
+fifths of the nodes that it needs with 4 points, at 2e-5 a quarter."""
+
+BEYOND = 4
+"""Nodes of a grid past each edge of a face, as there."""
 
 # Axis, right and down of each face, +X -X +Y -Y +Z -Z: the direction of (s, t) is axis + s·right + t·down.
 AXIS = np.array([[1, -1, 0, 0, 0, 0], [0, 0, 1, -1, 0, 0], [0, 0, 0, 0, 1, -1]], np.float64)
@@ -214,8 +220,8 @@ def source_solid_angles(env: Environment) -> np.ndarray:
 
 
 def grid_tangents(n: int) -> np.ndarray:
-    """(n,) face coordinates of the nodes of an equiangular grid, planning.BEYOND of them past each edge."""
-    return np.tan((2 * np.arange(n) + 1 - n) / (n - 2 * planning.BEYOND) * math.pi / 4)
+    """(n,) face coordinates of the nodes of an equiangular grid, BEYOND of them past each edge."""
+    return np.tan((2 * np.arange(n) + 1 - n) / (n - 2 * BEYOND) * math.pi / 4)
 
 
 def bounds(directions: np.ndarray, count: int) -> np.ndarray:
@@ -346,8 +352,8 @@ def row_edges(rows: int, real: Any) -> np.ndarray:
 def coarsening(fine: int, coarse: int, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The interpolation matrix (fine, coarse) between equiangular nodes, and for each coarse node the range
     [first, last) of fine nodes it takes part in."""
-    order = min(planning.ORDER, coarse)
-    ratio = (coarse - 2 * planning.BEYOND) / (fine - 2 * planning.BEYOND)
+    order = min(ORDER, coarse)
+    ratio = (coarse - 2 * BEYOND) / (fine - 2 * BEYOND)
     x = (2 * np.arange(fine) + 1 - fine) / 2 * ratio + (coarse - 1) / 2  # in coarse node numbers
     start = np.clip(np.floor(x).astype(int) - (order // 2 - 1), 0, coarse - order)
     matrix = np.zeros((fine, coarse))

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from whitefurnace.catalogue.choice import Chosen
 from whitefurnace.errors import UnsupportedError
 from whitefurnace.files import number
-from whitefurnace.integrals.quadrature import Integrated, integrate, missed, room_for
+from whitefurnace.integrals.quadrature import integrate, missed, room_for
 from whitefurnace.opencl.derived import finest, numbers_of
 from whitefurnace.opencl.device import Device
-from whitefurnace.prefiltering.recipe import Chosen
+from whitefurnace.results import Integrated
 
 SCHEMES = ("rational", "linear")
 """Of `smith`: a width k and a bend q that follow the roughness, or the width alone."""

@@ -16,7 +16,8 @@ from whitefurnace.catalogue import integral
 from whitefurnace.catalogue.rule import gauss
 from whitefurnace.catalogue.subsurface import Burley, Dipole, Gaussians, Profile, shape, skin
 from whitefurnace.errors import UsageError, nearest
-from whitefurnace.integrals.quadrature import Demand, Integrated, missed, room_for
+from whitefurnace.integrals.quadrature import Demand, missed, room_for
+from whitefurnace.results import Integrated
 from whitefurnace.scenes.scale import MEDIA, Medium
 
 SCHEMES = ("skin", "burley", "dipole", *(name for name in MEDIA if name not in ("water", "air")))

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import integral
+from whitefurnace.catalogue.choice import Chosen
 from whitefurnace.catalogue.rule import gauss
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
-from whitefurnace.integrals.quadrature import ROUNDING, Demand, Grid, Integrated, grid_of, integrate, missed, room_for
+from whitefurnace.integrals.quadrature import ROUNDING, Demand, Grid, grid_of, integrate, missed, room_for
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import numbers_of
 from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import evaluate
-from whitefurnace.prefiltering.recipe import Chosen
+from whitefurnace.results import Integrated
 
 FINE = 1e-11
 """The tolerance of albedos whose complements are told, in float64: at α = 1e-5 what is lost on average is 1e-9."""

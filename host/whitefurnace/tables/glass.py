@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from whitefurnace.catalogue.choice import Chosen
 from whitefurnace.catalogue.registry import REFRACTION
 from whitefurnace.catalogue.rule import LADDERS, Rule
 from whitefurnace.errors import UnsupportedError
-from whitefurnace.integrals.quadrature import Grid, Integrated, Part, Tally, climb, grid_of, integrate, missed, room_for
+from whitefurnace.integrals.quadrature import Grid, Part, Tally, climb, grid_of, integrate, missed, room_for
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import finest
 from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import CELLS_A_LAUNCH
-from whitefurnace.prefiltering.recipe import Chosen
+from whitefurnace.results import Integrated
 
 SCHEMES = ("entering", "leaving")
 """Light that comes from the side where the index is 1, or from the other: there Fresnel's n is 1/ior."""

@@ -24,14 +24,15 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import integral
+from whitefurnace.catalogue.choice import Chosen
 from whitefurnace.catalogue.rule import Rule, gauss
 from whitefurnace.errors import UnsupportedError
-from whitefurnace.integrals.quadrature import Integrated, grid_of, integrate, own_kernel_of, parts_of, room_for
+from whitefurnace.integrals.quadrature import grid_of, integrate, own_kernel_of, parts_of, room_for
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import finest
 from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import evaluate, over_cells
-from whitefurnace.prefiltering.recipe import Chosen
+from whitefurnace.results import Integrated
 
 SCHEMES = ("free", "heitz")
 _ALL = ("xx", "zx", "xz", "zz", "norm", "fresnel", "0", "sphere")

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import integral
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
 from whitefurnace.engines.presets import Dfg, engines
 from whitefurnace.errors import FileError, UnsupportedError, UsageError, nearest
 from whitefurnace.files import (
@@ -39,10 +40,10 @@ from whitefurnace.files import (
     write_text,
 )
 from whitefurnace.integrals.api import integrate
-from whitefurnace.integrals.quadrature import DEFAULT_TOLERANCE, Demand, Integrated, demand, rows_of_roughness
+from whitefurnace.integrals.quadrature import DEFAULT_TOLERANCE, Demand, demand, rows_of_roughness
 from whitefurnace.integrals.radiance import ENVIRONMENT_TOLERANCE, radiance_demand
 from whitefurnace.opencl.device import Device, choose_device
-from whitefurnace.prefiltering.recipe import Chosen, Spec, chosen, is_number
+from whitefurnace.results import Integrated
 from whitefurnace.sphere.environments import environment as load
 from whitefurnace.tables import bilinear, curves, diffusion, glass, ltc
 from whitefurnace.tables.energy import KINDS as OF_ENERGY

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from whitefurnace.catalogue.choice import Spec, chosen
 from whitefurnace.engines.presets import Dfg
 from whitefurnace.integrals.quadrature import integrate, rows_of_roughness
 from whitefurnace.opencl.device import Device
-from whitefurnace.prefiltering.recipe import Spec, chosen
 
 TOLERANCE = 5e-6
 """Of the pairs; half floats have steps of 2.4e-4."""

@@ -13,6 +13,7 @@ from zlib import crc32
 import numpy as np
 
 from whitefurnace.catalogue import SLOTS, Model, Parameter, models
+from whitefurnace.catalogue.choice import chosen, file_of
 from whitefurnace.catalogue.user import user_model
 from whitefurnace.errors import CheckError, InputError, UnsupportedError, UsageError, nearest
 from whitefurnace.integrals.normals import sample
@@ -22,7 +23,6 @@ from whitefurnace.opencl.derived import numbers_of
 from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import evaluate
 from whitefurnace.opencl.source import LEAST_COSINE
-from whitefurnace.prefiltering.recipe import chosen, file_of
 
 PRECISIONS = (32, 64)
 ROUNDING = {32: 2.0**-24, 64: 2.0**-53}

@@ -7,12 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from whitefurnace import plot_style as plots
+from whitefurnace import plot_style
 from whitefurnace.catalogue import Model, model
 from whitefurnace.catalogue.user import user_model
 from whitefurnace.errors import FileError, UnsupportedError
 from whitefurnace.files import read_image
 from whitefurnace.opencl.device import Device
+from whitefurnace.verification import figures
 from whitefurnace.verification.checks import Row
 
 LOBE = "real ndf_lobe_D(real cos_m, real spread) { return exp((cos_m - 1) / (spread * spread)); }\n"
@@ -29,7 +30,7 @@ PAINT = """real3 brdf_paint_f(real3 l, real3 v, real gloss) {
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer pixels: what is looked at here does not need them."""
-    monkeypatch.setattr(plots, "DPI", 40)
+    monkeypatch.setattr(plot_style, "DPI", 40)
 
 
 def row(entry: Model, passed: bool = True, **parameters: float) -> Row:
@@ -53,7 +54,8 @@ def colours(path: Path) -> int:
                                         ("fresnel", "one"), ("diffuse", "minnaert")])
 def test_a_figure_a_model(device: Device, tmp_path: Path, slot: str, name: str) -> None:
     entry = model(slot, name)
-    assert plots.draw(tmp_path / "figures", [entry], [row(entry)], device) == [tmp_path / f"figures/{slot}_{name}.png"]
+    path = tmp_path / "figures" / f"{slot}_{name}.png"
+    assert figures.draw(path.parent, [entry], [row(entry)], device) == [path]
     assert [p.name for p in (tmp_path / "figures").iterdir()] == [f"{slot}_{name}.png"]
     assert colours(tmp_path / f"figures/{slot}_{name}.png") > 20
 
@@ -66,7 +68,7 @@ def test_a_users_model(device: Device, tmp_path: Path, slot: str, name: str, tex
                        parameters: dict[str, float]) -> None:
     """With the parameters of its rows, or with guesses; a panel that a model has no values for says why."""
     entry = user(tmp_path, slot, name, text)
-    written = plots.draw(tmp_path, [entry], [row(entry, **parameters)] if parameters else [], device)
+    written = figures.draw(tmp_path, [entry], [row(entry, **parameters)] if parameters else [], device)
     assert written == [tmp_path / f"{slot}_{name}.png"] and colours(written[0]) > 20
 
 
@@ -74,15 +76,15 @@ def test_values_are_those_of_the_rows(tmp_path: Path) -> None:
     """One value, though a row of float32 has it rounded; of several, each; an entry's own are its typical ones."""
     entry = user(tmp_path, "ndf", "lobe", LOBE)
     rows = [row(entry, spread=v) for v in (0.3, float(np.float32(0.3)))]
-    assert plots._values(entry, rows) == {"spread": (0.3,)}
-    assert plots._values(entry, [*rows, row(entry, spread=0.5)]) == {"spread": (0.3, 0.5)}
+    assert figures._values(entry, rows) == {"spread": (0.3,)}
+    assert figures._values(entry, [*rows, row(entry, spread=0.5)]) == {"spread": (0.3, 0.5)}
     ggx = model("ndf", "ggx")
-    assert plots._values(ggx, [row(ggx, alpha=0.123)]) == {"alpha": ggx.parameters[0].typical}
+    assert figures._values(ggx, [row(ggx, alpha=0.123)]) == {"alpha": ggx.parameters[0].typical}
 
 
 def test_names_do_not_clash(device: Device, tmp_path: Path) -> None:
     mine, theirs = model("fresnel", "one"), model("fresnel", "one")
-    written = plots.draw(tmp_path, [mine, theirs], [], device)
+    written = figures.draw(tmp_path, [mine, theirs], [], device)
     assert [p.name for p in written] == ["fresnel_one.png", "fresnel_one_2.png"]
 
 
@@ -90,13 +92,13 @@ def test_the_same_bytes_twice_and_a_verdict(device: Device, tmp_path: Path, monk
     import matplotlib
 
     entry = model("diffuse", "burley")
-    first, = plots.draw(tmp_path / "a", [entry], [row(entry)], device)
+    first, = figures.draw(tmp_path / "a", [entry], [row(entry)], device)
     monkeypatch.setitem(matplotlib.rcParams, "lines.linewidth", 9)  # somebody's matplotlibrc
-    second, = plots.draw(tmp_path / "b", [entry], [row(entry)], device)
+    second, = figures.draw(tmp_path / "b", [entry], [row(entry)], device)
     assert first.read_bytes() == second.read_bytes()
     assert matplotlib.rcParams["lines.linewidth"] == 9
     assert b"tEXt" not in first.read_bytes() and b"tIME" not in first.read_bytes()
-    failed, = plots.draw(tmp_path / "c", [entry], [row(entry, passed=False)], device)
+    failed, = figures.draw(tmp_path / "c", [entry], [row(entry, passed=False)], device)
     assert failed.read_bytes() != first.read_bytes()
 
 
@@ -109,16 +111,16 @@ def test_no_half_file(device: Device, tmp_path: Path, monkeypatch: pytest.Monkey
 
     monkeypatch.setattr(Figure, "savefig", fails)
     with pytest.raises(FileError, match=r"fresnel_one\.png: No space left"):
-        plots.draw(tmp_path, [model("fresnel", "one")], [], device)
+        figures.draw(tmp_path, [model("fresnel", "one")], [], device)
     assert not list(tmp_path.iterdir())
     (tmp_path / "file").touch()
     with pytest.raises(FileError, match="cannot make"):
-        plots.draw(tmp_path / "file", [model("fresnel", "one")], [], device)
+        figures.draw(tmp_path / "file", [model("fresnel", "one")], [], device)
 
 
 def test_without_matplotlib(tmp_path: Path, device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(UnsupportedError) as caught:
-        plots.draw(tmp_path / "figures", [model("ndf", "ggx")], [], device)
+        figures.draw(tmp_path / "figures", [model("ndf", "ggx")], [], device)
     assert str(caught.value) == 'figures need matplotlib: pip install "whitefurnace[plot]"'
     assert not (tmp_path / "figures").exists()
