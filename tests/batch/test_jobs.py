@@ -25,6 +25,7 @@ from whitefurnace.baking import bake as baking
 from whitefurnace.batch import jobs as batch
 from whitefurnace.errors import FileError
 from whitefurnace.files import acquire, lock_path, write_exr
+from whitefurnace.opencl.device import choose_device
 from whitefurnace.sphere.environments import source_digest
 from whitefurnace.tables import lut as tables
 
@@ -791,3 +792,22 @@ def test_help_of_batch_imports_nothing_heavy():
     assert subprocess.run([sys.executable, "-c", script], capture_output=True).returncode == 0
 
 
+def test_workers_use_the_device_of_their_parent(tmp_path, monkeypatch):
+    """Each worker is told the address of the parent's device; a worker that chose for itself could find another."""
+    write_exr(tmp_path / "a.exr", np.full((8, 16, 3), 0.5, np.float32))
+    (tmp_path / "job.toml").write_text('[[bake]]\nenvironments = ["a.exr"]\nsize = 8\nmin_size = 4\noutput = "out"\n')
+    seen = []
+    monkeypatch.setattr(batch.pool, "run", lambda stages, items, **options: seen.extend(items))
+    for options in ({}, {"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}):
+        batch.run(batch.job(tmp_path / "job.toml"), on_result=print, **options)
+    address = choose_device().address
+    assert [item.device for item in seen] == [None, address, None]
+
+
+def test_workers_say_why_no_device_works(tmp_path, monkeypatch):
+    write_exr(tmp_path / "a.exr", np.full((8, 16, 3), 0.5, np.float32))
+    (tmp_path / "job.toml").write_text('[[bake]]\nenvironments = ["a.exr"]\nsize = 8\nmin_size = 4\noutput = "out"\n')
+    seen = []
+    monkeypatch.setattr(batch.pool, "run", lambda stages, items, **options: seen.extend(items))
+    batch.run(batch.job(tmp_path / "job.toml", device="no such device"), on_result=print, workers=2)
+    assert [item.device for item in seen] == ["no such device"]

@@ -491,7 +491,7 @@ def test_a_second_interrupt_stops_and_abandons(tmp_path, workers):
 BUSY = """
 import time
 import numpy as np
-from whitefurnace.device import choose_device
+from whitefurnace.opencl.device import choose_device
 device = choose_device({name!r})
 program = device.build('''kernel void busy(global float *x, int n) {{
     size_t i = get_global_id(0); float a = x[i];

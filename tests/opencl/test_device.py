@@ -5,13 +5,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from whitefurnace.errors import DeviceError, UnsupportedError, UsageError
 from whitefurnace.opencl import device as devices
-from whitefurnace.opencl.device import Device, choose_device, find_devices
+from whitefurnace.opencl.device import Device, choose_device, device_address, find_devices
 
 SCALE = """
 kernel void scale(global const float *x, global float *y, float factor, global const float *offset)
@@ -292,3 +293,24 @@ def test_a_buffer_refuses_another_shape(device):
 def test_a_buffer_too_large_says_so(device):
     with pytest.raises(DeviceError, match=r"a buffer of [\d.]+ MiB is above the largest"):
         device.empty(device.max_allocation + 1, np.uint8)
+
+
+def test_an_address_finds_the_very_device(device):
+    assert choose_device(device.address) is device
+    assert device_address(device.address) == device.address
+
+
+def test_devices_that_are_called_alike_have_addresses_of_their_own(monkeypatch):
+    class Raw:  # compared by identity, as pyopencl compares devices
+        platform = SimpleNamespace(name="Vendor ")
+
+        def __init__(self, name):
+            self.name = name
+
+    twins, other = [Raw("GPU"), Raw("GPU")], Raw("CPU")
+    monkeypatch.setattr(devices, "_list_devices", lambda: [*twins, other])
+    monkeypatch.setattr(devices, "_try", lambda raw: (raw, "works"))
+    addresses = [devices._address(raw) for raw in (*twins, other)]
+    assert addresses == ["Vendor: GPU #1", "Vendor: GPU #2", "Vendor: CPU"]
+    for raw, address in zip((*twins, other), addresses, strict=True):
+        assert choose_device(address) is raw

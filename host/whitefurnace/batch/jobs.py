@@ -24,6 +24,7 @@ from whitefurnace.batch import pool
 from whitefurnace.catalogue.choice import file_of
 from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, nearest
 from whitefurnace.files import digest_file, is_lock, is_safe, locks_in, write_text
+from whitefurnace.opencl.device import device_address
 from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
 from whitefurnace.sphere.environments import extent, source_files
 from whitefurnace.tables import lut as tables
@@ -775,11 +776,32 @@ STAGES = pool.Stages(prepare, compute, write, abandon, failed, Result, load)
 def run(job: Job, *, workers: int = 1, scheduler: str | None = None, on_result: Callable[[Result], None],
         on_notice: Callable[[str], None] | None = None) -> None:
     """Does every item; `on_result` hears of each in the order they end. What a killed run left in the job's folders is
-    removed at the end. Raises what `pool.run` does."""
+    removed at the end.
+
+    Workers of this machine use the device that this process would use; those of a cluster choose on their own machine.
+    Raises what `pool.run` does.
+    """
+    items: Iterable[Item] = job.items
+    if scheduler is None and workers > 1:
+        items = _on_one_device(job.items)
     try:
-        pool.run(STAGES, job.items, workers=workers, scheduler=scheduler, on_result=on_result, on_notice=on_notice)
+        pool.run(STAGES, items, workers=workers, scheduler=scheduler, on_result=on_result, on_notice=on_notice)
     finally:
         clean(job)
+
+
+def _on_one_device(items: Iterable[Item]) -> Iterator[Item]:
+    """The items with their device named so that any process of this machine finds the same one.
+
+    Where none works the items keep what was asked for, and each that needs a device fails with the reason.
+    """
+    known: dict[str | None, str | None] = {}
+    for item in items:
+        if item.device not in known:
+            known[item.device] = item.device
+            with contextlib.suppress(WhitefurnaceError):
+                known[item.device] = device_address(item.device)
+        yield msgspec.structs.replace(item, device=known[item.device])
 
 
 class Tally:

@@ -227,6 +227,12 @@ def _label(raw: Any) -> str:
     return f"{raw.platform.name.strip()}: {raw.name.strip()}"
 
 
+def _address(raw: Any) -> str:
+    """A name that finds this very device again in another process: its label, numbered where several share one."""
+    alike = [other for other in _list_devices() if _label(other) == _label(raw)]
+    return _label(raw) + (f" #{alike.index(raw) + 1}" if len(alike) > 1 else "")
+
+
 def _refusal(error: BaseException, noise: Sequence[str]) -> str:
     """One line that tells why a probe failed: the compiler's first error where there is one."""
     return _first_errors(str(error), noise, limit=1) or _first_line(error)
@@ -286,8 +292,11 @@ def choose_device(name: str | None = None) -> Device:
     wanted = listed
     if name is not None and listed:
         text = name.strip().lower()
+        addressed = [raw for raw in listed if _address(raw).lower() == text]
         if text.isdecimal() and int(text) < len(listed):
             wanted = [listed[int(text)]]
+        elif addressed:
+            wanted = addressed
         else:
             labels = [_label(raw).lower() for raw in listed]
             wanted = [raw for raw, label in zip(listed, labels, strict=True)
@@ -305,6 +314,15 @@ def choose_device(name: str | None = None) -> Device:
         refused = ["no OpenCL platform was found"]
     raise DeviceError(f"no OpenCL device {'called ' + repr(name) + ' ' if name else ''}works: "
                       f"{'; '.join(refused)}; {INSTALL}")
+
+
+def device_address(name: str | None = None) -> str:
+    """Return the name by which another process of this machine finds the device that `choose_device(name)` gives.
+
+    An index or the preference among several devices may come out differently there; this name does not.
+    Raises what `choose_device` raises.
+    """
+    return choose_device(name).address
 
 
 # ---------------------------------------------------------------------------------------------- running
@@ -482,6 +500,11 @@ class Device:
         if not self.fp64:
             raise UnsupportedError(f"{self.name} has no float64; use --precision 32 or another device")
         return max(self._lanes // 2, 1)
+
+    @property
+    def address(self) -> str:
+        """The name by which `choose_device` finds this very device in another process of this machine."""
+        return _address(self._raw)
 
     def identity(self) -> dict[str, str]:
         """What a manifest records of the device: name, platform, driver, version, type."""
