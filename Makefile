@@ -2,6 +2,7 @@
 #
 #   make [bake] [ENV=image] [OUT=folder] [ARGS='--size 512 ...']     bakes the demo or your environment
 #   make test | test-all [ARGS='-k name']                            test-all: those that take minutes too
+#   make test-plain                                                  the wheel without any extra
 #   make test-engines                                                three.js, Babylon.js, Filament in Chromium
 #   make bench | lint | devices | clean
 
@@ -22,7 +23,7 @@ SOURCES := setup.cfg pyproject.toml LICENSE $(wildcard README.md) \
 .ONESHELL:
 .SHELLFLAGS = -ec
 .DELETE_ON_ERROR:
-.PHONY: bake test test-all test-engines bench lint devices clean
+.PHONY: bake test test-all test-plain test-engines bench lint devices clean
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 # What is tested is the wheel, whatever the caller's shell has on its path.
 unexport PYTHONPATH
@@ -36,6 +37,16 @@ test: $(VENV)/device.done $(VENV)/test.done
 test-all: $(VENV)/device.done $(VENV)/test.done
 	@$(BIN)/pytest $(ARGS) tests
 
+# An environment that has the wheel alone; a runtime from pip comes along where the system has none.
+test-plain: $(VENV)/device.done
+	@rm -rf $(VENV)/plain
+	$(PYTHON) -m venv $(VENV)/plain
+	$(VENV)/plain/bin/pip install --quiet "$(WHEEL)"
+	$(VENV)/plain/bin/whitefurnace devices >/dev/null 2>&1 || {
+		$(BIN)/pip freeze | grep -iE '^(pocl|intel)' | xargs $(VENV)/plain/bin/pip install --quiet
+	}
+	$(VENV)/plain/bin/python tests/plain_install.py
+
 # What they need and cannot be had is a reason to skip them, told at the end.
 test-engines: $(VENV)/device.done $(VENV)/test.done $(VENV)/engines/node_modules
 	@export WHITEFURNACE_NODE_MODULES="$${WHITEFURNACE_NODE_MODULES:-$(CURDIR)/$(VENV)/engines/node_modules}"
@@ -47,6 +58,7 @@ bench: $(VENV)/device.done $(VENV)/test.done
 lint: $(VENV)/lint.done
 	@$(BIN)/ruff check .
 	$(BIN)/mypy
+	$(BIN)/mypy --config-file= --strict tests/typed_use.py
 
 devices: $(VENV)/installed.done
 	@$(BIN)/whitefurnace devices
