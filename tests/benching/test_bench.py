@@ -19,7 +19,7 @@ from whitefurnace.benching import tradeoff
 from whitefurnace.benching.figures import draw_tradeoff
 from whitefurnace.benching.throughput import CASES, FLOPS, Meter, Spread
 from whitefurnace.benching.tradeoff import Cost, Missed, Point
-from whitefurnace.cli import report
+from whitefurnace.cli import bench as printed
 from whitefurnace.errors import UsageError
 from whitefurnace.files import read_image, write_exr
 from whitefurnace.opencl import source
@@ -185,7 +185,7 @@ def test_a_missed_point_is_told(device: Device, light: np.ndarray, monkeypatch: 
     monkeypatch.setattr(tradeoff.lighting, "prefilter", fails)
     found = list(tradeoff.points(environment(light), device, size=16, todo=[("tolerance", 1e-3)]))
     assert found == [Missed("array", "tolerance", 1e-3, "finer grids do not help")]
-    assert "finer grids do not help" in report.tradeoff_text([], found)  # type: ignore[arg-type]
+    assert "finer grids do not help" in printed.tradeoff_text([], found)  # type: ignore[arg-type]
 
 
 def test_costs(device: Device, light: np.ndarray) -> None:
@@ -226,14 +226,14 @@ COSTS = [Cost("sky", over, value, Spread(value, value, value), 1) for over in ("
 
 
 def test_text_and_json() -> None:
-    text = report.tradeoff_text(POINTS)
+    text = printed.tradeoff_text(POINTS)
     assert "0.001 normal" in text and re.search(r"samples +1024 ", text) and "(90 … 110)" in text
     assert text.count("front") == 2
-    rows = report.tradeoff_rows([*POINTS, Missed("sky", "samples", 32, "why"), *COSTS])
+    rows = printed.tradeoff_rows([*POINTS, Missed("sky", "samples", 32, "why"), *COSTS])
     rows = [json.loads(json.dumps(row, allow_nan=False)) for row in rows]
     assert [row["event"] for row in rows] == ["point"] * 3 + ["missed"] + ["cost"] * 6
     assert rows[0]["seconds"] == {"median": 0.02, "min": pytest.approx(0.018), "max": pytest.approx(0.022)}
-    assert "alpha" in report.costs_text(COSTS, 1e-3)
+    assert "alpha" in printed.costs_text(COSTS, 1e-3)
 
 
 def test_figure(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -252,13 +252,13 @@ def test_the_script_that_fills_the_readme(device: Device, meter: Meter) -> None:
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     measured = list(benching.throughput(benching.cases(("evaluate", "demo")), device, meter, runs=1))
-    said, head, table = script.throughput([*map(report.bench_row, measured),
-                                           report.yardstick_row(meter.yardstick(), device.identity())])
+    said, head, table = script.throughput([*map(printed.bench_row, measured),
+                                           printed.yardstick_row(meter.yardstick(), device.identity())])
     assert device.identity()["name"] in said
     assert [row[:2] for row in table] == [["evaluate", "cells"], ["demo", "points"]]
     assert all(len(row) == len(head) for row in table)
     whose = {"event": "device", "device": device.identity()}
-    said, head, table = script.tradeoff([*report.tradeoff_rows(POINTS), whose])
+    said, head, table = script.tradeoff([*printed.tradeoff_rows(POINTS), whose])
     assert head == ["method", "setting", "sky"]
     assert table[0] == ["tolerance", "0.01", "20 ms, 5.0e-03 *"] and table[2] == ["samples", "1024", "500 ms, 5.0e-02"]
     readme = (ROOT / "README.md").read_text("utf-8")

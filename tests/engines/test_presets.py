@@ -13,7 +13,8 @@ import pytest
 from reference import cube_directions
 from whitefurnace import bake, dfg
 from whitefurnace.baking.outputs import targets
-from whitefurnace.cli import main, report
+from whitefurnace.cli import main
+from whitefurnace.cli.bake import baked_text
 from whitefurnace.engines.presets import ENGINES, FORMATS, Dfg, Engine, File, as_text, axes_matrix, engines, user_engine
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.expression import LANGUAGES, Expression, table_text
@@ -272,7 +273,7 @@ def test_sheen_on_a_hard_panel_is_baked_and_says_what_it_reached(tmp_path, devic
     assert [row["roughness"] for row in rows["ggx"]] == pytest.approx([0, 1 / 3, 2 / 3, 1])
     assert [row["roughness"] for row in rows["charlie"]] == pytest.approx([1 / 3, 2 / 3, 1])  # level 0 is the same
     assert max(row["error"] for row in rows["ggx"]) <= 1e-3 and max(row["error"] for row in rows["charlie"]) <= 1e-2
-    text = report.baked_text(made, tmp_path)
+    text = baked_text(made, tmp_path)
     assert "specular 3" in text and "specular 4" not in text and "sheen 3" in text
 
 

@@ -83,7 +83,7 @@ def test_every_container_gives_the_levels_that_were_written(tmp_path, suffix, fo
 
 
 def shown(path: Path) -> str:
-    from whitefurnace.cli.report import inspect_text
+    from whitefurnace.cli.inspect import inspect_text
 
     return inspect_text(described(contents(path)))
 

@@ -14,7 +14,7 @@ import pytest
 
 from whitefurnace import cli
 from whitefurnace.catalogue import SLOTS, Model, model, models
-from whitefurnace.cli import report
+from whitefurnace.cli.verify import verify_text
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.opencl.device import Device
 from whitefurnace.verification import checks as verification
@@ -61,7 +61,7 @@ def failed(rows: list[Row]) -> dict[str, Row]:
 
 
 def told(row: Row) -> str:
-    return report.verify_text([row])
+    return verify_text([row])
 
 
 # ---------------------------------------------------------------------------------------------- what is right

@@ -1,0 +1,192 @@
+"""`whitefurnace lut`: its options, what it prints and its JSON row."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from whitefurnace.cli import options
+from whitefurnace.cli.terminal import print_row, progress, say
+from whitefurnace.text import size, table
+
+if TYPE_CHECKING:
+    from whitefurnace.tables.lut import Table
+
+EPILOG = """\b
+Examples:
+  whitefurnace lut dfg -o dfg.npy --size 256
+  whitefurnace lut dfg -o fitted.npy --size 64 --axis sqrt --fit bilinear
+  whitefurnace lut energy -o energy.npy --size 64 --scheme turquin
+  whitefurnace lut ltc -o ltc.npy
+  whitefurnace lut glass -o glass.ktx2 --size 32
+  whitefurnace lut smith -o smith.h --ndf abc:c=1.5
+  whitefurnace lut diffusion -o skin.png --size 256
+  whitefurnace lut albedo -o gold.exr --fresnel schlick:gold --size 64x32
+  whitefurnace lut albedo -o sheen.npy --ndf charlie --axis alpha=.01:1:64:log --tolerance 1e-4
+  whitefurnace lut albedo_average -o average.npy --fresnel schlick --axis f0=0:1:32
+  whitefurnace lut albedo -o diffuse.npy --diffuse burley --set albedo=.8
+  whitefurnace lut radiance -o lit.exr --light punctual --set NoL=.5 --set color=1 --tolerance 1e-4
+
+The array is [y, x] or [y, x, channel]; further axes come first. x is NoV = (x + ½)/N. y is the perceptual roughness
+r = (y + ½)/M, smoothest in row 0; the models' own parameters follow r (α = r² for GGX). An integral without a view
+direction has one axis, r, as x.
+
+--set fixes a parameter and drops the axis that would vary it: NoV, roughness, phi, a parameter of a model, or
+ndf_alpha for the alpha of the slot ndf. --axis NAME=A:B:N replaces the usual axis of that name, or adds a slower one.
+The first and last values are A and B, except on the scale `centres`. FILE.json beside FILE describes the table.
+
+Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported,
+7 a check failed, 130 interrupted.
+"""
+
+OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of the kind radiance", "Accuracy"
+
+
+@options.command("Bake and tabulate", "Tabulate an integral of a BRDF over roughness and view angle", EPILOG)
+@click.argument("kind")
+@options.output_file("Table to write: .npy, .exr, .png (values from 0 to 1), .ktx2, .dds or .h.")
+@options.option("--format", "stored", metavar="NAME", heading=OUTPUT,
+                help="Pixel format: rg16f, rgba16f or rgba32f in .ktx2 and .dds; r16 or r8 in .png. [default: the "
+                     "first of these that has enough channels]")
+@options.option("--for", "for_", metavar="ENGINE", heading=OUTPUT,
+                help="Use the size, axes and form that an engine reads (see `whitefurnace engines`). Of dfg.")
+@options.option("--scheme", metavar="NAME", heading=OUTPUT,
+                help="Form of the table. dfg: scale_bias (the default) or multiscatter; energy: kulla_conty (the "
+                     "default), turquin or fdez_aguera; ltc: free (the default) or heitz; glass: entering (the "
+                     "default) or leaving; smith: rational (the default) or linear; diffusion: skin (the default), "
+                     "burley, dipole, or a medium, as marble.")
+@options.option("--size", metavar="N|NxM", heading=AXES,
+                help="Number of cells along x and y, each 1 to 16384. [default: 128, 64 for ltc]")
+@options.option("--axis", "axes", metavar="NAME=A:B:N[:SCALE]", multiple=True, heading=AXES,
+                help="Vary the parameter NAME from A to B in N steps; may be repeated. SCALE is linear (the default), "
+                     "log, centres, sqrt, f0 or angle; a SCALE alone is that of NoV.")
+@options.option("--set", "fixed", metavar="NAME=VALUE", multiple=True, heading=AXES,
+                help="Fix the parameter NAME at VALUE; may be repeated.")
+@options.option("--backfacing", metavar="clamp|absolute", heading=AXES,
+                help="Accept view directions below the surface (NoV < 0): clamp NoV to 0, or take its absolute value. "
+                     "[default: refuse them]")
+@options.ndf("[default: ggx, unless --diffuse or --brdf is given]", heading=MODELS)
+@options.option("--masking", metavar="NAME", heading=MODELS,
+                help="Masking and shadowing model, a name from `whitefurnace models`. [default: smith]")
+@options.option("--fresnel", metavar="NAME[:p=v,...]", heading=MODELS,
+                help=options.fresnel_help("") + " [default: one]")
+@options.option("--diffuse", metavar="NAME[:p=v,...]", heading=MODELS,
+                help="Diffuse model, added to the specular reflection of --ndf, or alone without --ndf. Of albedo and "
+                     "albedo_average.")
+@options.option("--brdf", metavar="FILE.clh", heading=MODELS,
+                help="A whole BRDF of your own, in RGB. Of albedo and albedo_average.")
+@options.light("Light source:", heading=LIGHT)
+@options.option("--environment", metavar="ENV", heading=LIGHT,
+                help="Environment image in place of a light, in RGB.")
+@options.option("--normal", metavar="X Y Z", type=float, nargs=3, heading=LIGHT,
+                help="Surface normal in the environment. [default: 0 1 0]")
+@options.rotate(LIGHT)
+@options.exposure(LIGHT)
+@options.nonfinite(LIGHT)
+@options.tolerance("Largest absolute error, above 0 and below 1. [default: 1e-6, or 1e-12 with --precision 64; some "
+                   "kinds have their own]")
+@options.option("--precision", metavar="32|64", type=int, default=32, show_default=True, heading=ACCURACY,
+                help="Bits of the floating-point numbers that the device computes with.")
+@options.option("--fit", metavar="bilinear", heading=ACCURACY,
+                help="With `bilinear`, fit the texels so that reads between them are most accurate. For tables of two "
+                     "axes; implies --as-read.")
+@options.as_read("Also measure the error of reads between texels, from float16 and 8-bit textures too.")
+@options.device()
+@options.dry_run()
+@options.force()
+@options.as_json()
+@options.quiet()
+def lut(kind: str, output: Path, stored: str | None, for_: str | None, scheme: str | None, size: str | None,
+        axes: tuple[str, ...], fixed: tuple[str, ...], backfacing: str | None, ndf: str | None, masking: str | None,
+        fresnel: str | None, diffuse: str | None, brdf: str | None, light: str | None, environment: str | None,
+        normal: tuple[float, float, float] | None, rotate: float, exposure: float, nonfinite: str,
+        tolerance: float | None, precision: int, fit: str | None, as_read: bool, device: str | None, dry_run: bool,
+        force: bool, as_json: bool, quiet: bool) -> None:
+    """Write a table of an integral over a grid of parameters.
+
+    KIND is normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance; energy, the energy of
+    multiple scattering; sheen, with the share that it leaves to the layer below; fresnel_average; glass, the light that
+    a rough boundary reflects and transmits; smith and norm, coefficients of fitted curves; diffusion, diffuse light on
+    skin and other media over NoL and curvature (1/radius in 1/mm); or ltc, linearly transformed cosines for polygonal
+    lights (ltc_1 and ltc_2 are its two textures).
+    """
+    from whitefurnace.tables import lut as tables
+
+    axes = tuple(f"NoV={item}" if item in tables.SCALES else item for item in axes)
+    request = tables.order(
+        kind, output, stored=stored, for_=for_, scheme=scheme, size=size, axes=tables.named("--axis", axes),
+        parameters=tables.named("--set", fixed), backfacing=backfacing, ndf=ndf, masking=masking, fresnel=fresnel,
+        diffuse=diffuse, brdf=brdf, light=light, environment=environment, normal=normal, rotate=rotate,
+        exposure=exposure, nonfinite=nonfinite, tolerance=tolerance, precision=precision, fit=fit, as_read=as_read,
+        force=force)
+    with progress(not (quiet or as_json)) as report:
+        made = tables.make(request, device, dry_run=dry_run, progress=report)
+    for notice in () if quiet else made.notices:
+        say(f"notice: {made.path.name}: {notice}")
+    print_table(made, as_json, quiet)
+
+
+def print_table(made: Table, as_json: bool, quiet: bool) -> None:
+    """Print what was or would be written of a table."""
+    if as_json:
+        print_row(table_row(made))
+    elif not quiet:
+        click.echo(table_text(made))
+
+
+def table_text(table: Table) -> str:
+    """What `lut` wrote or would write."""
+    name, beside = table.path, table.path.with_name(table.path.name + ".json")
+    if table.state == "skipped":
+        return f"{name}: up to date, nothing to do ({beside})"
+    m = table.manifest
+    recipe = m.get("recipe", m)
+    shape = " × ".join(str(n) for n in table.shape)
+    of = ", ".join(c["name"] for c in recipe["models"].values()) or recipe["scheme"]
+    lines = [f"{name}: {recipe['integral']}, {of}"
+             f"; array of {shape}, float{recipe['precision']}"]
+    lines += [f"  {axis}  {along}" for axis, along in zip("xyzuvw", table.axes, strict=False)]
+    if table.state == "planned":
+        return "\n".join([*lines, f"  would write {name}  {size(table.nbytes)} before compression",
+                          f"  would write {beside}  the manifest"])
+    lines += _stated_lines(m)
+    where = f"on {m['device']['name']} ({m['device']['platform']})" if "device" in m else "in numpy"
+    done = f"  error {m['error']:.1e}, rule {m['rule']}, {m['evaluations']:.2g} evaluations, {where}"
+    return "\n".join([*lines, done,
+                      f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {table.seconds:.2f} s"])
+
+
+def _stated_lines(m: Mapping[str, Any]) -> list[str]:
+    """What a manifest says of a table beside its error."""
+    lines = []
+    if "channels" in m:
+        lines.append(f"  channels  {', '.join(m['channels'])}")
+        lines += [f"  formula   {m['formula']}"] if "formula" in m else []
+    if "stored" in m:
+        lines += [f"  stored as {m['stored']['format']}: off by {m['stored']['error']:.1e} at most, beside the error"]
+    if "furnace" in m:
+        lines += [f"  furnace at F = 1: off by {m['furnace']:.1e}; "
+                  f"f(l, v) and f(v, l) differ by {m['non_reciprocity']:.2g}",
+                  "  off Kulla and Conty's at F0 = " +
+                  ", ".join(f"{f0}: {off:.1e}" for f0, off in m["deviation"].items())]
+    if "misplaced" in m:
+        told = {f"at texels, {k}": e for k, e in m["misplaced"].items() if k != "between"}
+        told |= {f"between, {k}": e for k, e in m["misplaced"].get("between", {}).items()}
+        names = ("mean", "median", "p99", "max")
+        lines.append(table(["  energy misplaced", *names],
+                           [(f"  {where}", *(f"{e[k]:.3f}" for k in names)) for where, e in told.items()]))
+    if "as_read" in m:
+        read = m["as_read"]
+        rows = [(name, *(f"{e[k]:.1e}" for k in ("p99", "max", "max_all"))) for name, e in
+                (("at texel centres", read["centres"]), *((f"between, {k}", e) for k, e in read["between"].items()))]
+        lines.append(table(["  as read", "p99", "max", "max, with r < .045"], [(f"  {r[0]}", *r[1:]) for r in rows]))
+    return lines
+
+
+def table_row(table: Table) -> dict[str, Any]:
+    """The JSON row of a table."""
+    return {"event": table.state, "file": str(table.path), "shape": list(table.shape), "seconds": table.seconds,
+            **{name: value for name, value in table.manifest.items() if name not in ("whitefurnace", "name")},
+            "notices": list(table.notices)}

@@ -1,0 +1,166 @@
+"""Commands and options in groups: the help of `whitefurnace` by task, that of a command by the subject of its options.
+
+An option that several commands have stands here once, as a decorator. This module loads nothing heavy: `--help` is
+quick.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import click
+
+Task = Literal["Bake and tabulate", "Look and compare", "Prove and measure", "Scenes and batches", "Lists"]
+
+TASKS: tuple[Task, ...] = ("Bake and tabulate", "Scenes and batches", "Look and compare", "Prove and measure", "Lists")
+"""The headings of `whitefurnace --help` in their order."""
+
+RUNNING = "Running"
+"""The heading of options that change how a command runs and reports, and not its results."""
+
+FilePath = click.Path(path_type=Path)
+
+Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
+
+
+class Option(click.Option):
+    """An option with the heading that it stands under in the help of its command."""
+
+    def __init__(self, names: Sequence[str], *, heading: str = RUNNING, **attributes: Any) -> None:
+        super().__init__(names, **attributes)
+        self.heading = heading
+
+
+class Command(click.Command):
+    """A command with its task, whose help lists the options under their headings."""
+
+    def __init__(self, name: str | None, *, task: Task, **attributes: Any) -> None:
+        super().__init__(name, **attributes)
+        self.task = task
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write a definition list for each heading, in the order in which the options are declared."""
+        groups: dict[str, list[tuple[str, str]]] = {}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx) if isinstance(parameter, click.Option) else None
+            if record is not None:
+                groups.setdefault(getattr(parameter, "heading", RUNNING), []).append(record)
+        if list(groups) == [RUNNING]:
+            groups = {"Options": groups[RUNNING]}
+        for heading, records in groups.items():
+            with formatter.section(heading):
+                formatter.write_dl(records)
+
+
+class Group(click.Group):
+    """A group whose help lists the commands by task."""
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write a definition list for each task of `TASKS`: the name of every command and its summary."""
+        known = [(name, command) for name in self.list_commands(ctx)
+                 if isinstance(command := self.get_command(ctx, name), Command)]
+        width = max(len(name) for name, _ in known)
+        for task in TASKS:
+            rows = [(name.ljust(width), command.short_help or "") for name, command in known if command.task == task]
+            if rows:
+                with formatter.section(task):
+                    formatter.write_dl(rows)
+
+
+def command(task: Task, summary: str, epilog: str) -> Callable[[Callable[..., Any]], Command]:
+    """Make a function the command of its own name.
+
+    task: the heading in `whitefurnace --help`. summary: one line beside the name there, at most 62 characters.
+    epilog: examples and exit codes, after the options.
+    """
+    return click.command(cls=Command, task=task, short_help=summary, epilog=epilog)
+
+
+def option(*names: str, heading: str, help: str, **attributes: Any) -> Decorator:
+    """An option of one command; `attributes` are those of `click.option`."""
+    return click.option(*names, cls=Option, heading=heading, help=help, **attributes)
+
+
+# ---------------------------------------------------------------------------------------------- shared options
+
+
+def output_folder(help: str, *, required: bool = False, heading: str = "Output") -> Decorator:
+    return option("-o", "--output", metavar="DIR", required=required, type=FilePath, heading=heading, help=help)
+
+
+def output_file(help: str) -> Decorator:
+    return option("-o", "--output", metavar="FILE", required=True, type=FilePath, heading="Output", help=help)
+
+
+def ndf(help: str, *, default: str | None = None, heading: str) -> Decorator:
+    return option("--ndf", metavar="NAME[:p=v,...]", default=default, show_default=default is not None,
+                  heading=heading, help="Microfacet distribution with its parameters: a name from `whitefurnace "
+                                        f"models`, or a FILE.clh of your own. {help}".strip())
+
+
+def fresnel_help(help: str) -> str:
+    """The help of an option that takes a Fresnel model."""
+    return f"Fresnel model{help}, as NAME[:p=v,...] or NAME:PRESET (schlick:gold); see `whitefurnace models`."
+
+
+def light(help: str, *, multiple: bool = False, heading: str) -> Decorator:
+    return option("--light", metavar="NAME[:p=v,...]", multiple=multiple, heading=heading,
+                  help=f"{help} punctual, ambient, disc or rectangle; `whitefurnace models NAME` lists its parameters.")
+
+
+def tolerance(help: str, *, heading: str = "Accuracy") -> Decorator:
+    return option("--tolerance", metavar="X", type=float, heading=heading, help=help)
+
+
+def rotate(heading: str) -> Decorator:
+    return option("--rotate", metavar="DEG", type=float, default=0.0, heading=heading,
+                  help="Rotate the environment by DEG degrees about +Y, from +X towards +Z. [default: 0]")
+
+
+def exposure(heading: str, what: str = "the radiance of the environment") -> Decorator:
+    return option("--exposure", metavar="EV", type=float, default=0.0, heading=heading,
+                  help=f"Multiply {what} by 2^EV; EV is -64 to 64. [default: 0]")
+
+
+def nonfinite(heading: str) -> Decorator:
+    return option("--nonfinite", metavar="refuse|zero", default="refuse", show_default=True, heading=heading,
+                  help="NaN, infinite and negative values in the environment: refuse the image, or set them to zero.")
+
+
+def certify(help: str, *, default: int | None = None) -> Decorator:
+    return option("--certify", metavar="N", type=int, default=default, show_default=default is not None,
+                  heading="Accuracy", help=help)
+
+
+def as_read(help: str) -> Decorator:
+    return option("--as-read", is_flag=True, heading="Accuracy", help=help)
+
+
+def plot(what: str) -> Decorator:
+    return option("--plot", "folder", metavar="DIR", type=FilePath, heading="Output",
+                  help=f"Draw {what} as PNG files into the folder DIR. Needs matplotlib.")
+
+
+def device(heading: str = RUNNING) -> Decorator:
+    return option("--device", metavar="NAME", heading=heading,
+                  help="OpenCL device: its number or a part of its name as `whitefurnace devices` lists them. "
+                       "[default: $WHITEFURNACE_DEVICE, else the best that works]")
+
+
+def dry_run(help: str = "Print what would be computed and written, and do nothing.") -> Decorator:
+    return option("--dry-run", is_flag=True, heading=RUNNING, help=help)
+
+
+def force(help: str = "Make outputs again that are up to date, and overwrite files that this tool did not write.",
+          ) -> Decorator:
+    return option("--force", is_flag=True, heading=RUNNING, help=help)
+
+
+def as_json() -> Decorator:
+    return option("--json", "as_json", is_flag=True, heading=RUNNING,
+                  help="Print the results as JSON Lines on stdout, and nothing else there.")
+
+
+def quiet(help: str = "Print errors only.") -> Decorator:
+    return option("--quiet", is_flag=True, heading=RUNNING, help=help)

@@ -1,0 +1,77 @@
+"""What all commands print with: JSON rows on stdout, notices on stderr, progress bars where stderr is a terminal."""
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+def print_row(row: Mapping[str, Any]) -> None:
+    """Print one JSON row on stdout. Raises ValueError for NaN and infinity: see `plain`."""
+    click.echo(json.dumps(row, ensure_ascii=False, allow_nan=False, default=str))
+
+
+def say(text: str) -> None:
+    """Print a line on stderr."""
+    click.echo(text, err=True)
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON can hold it: NaN and infinities as strings, tuples as lists, also inside mappings and lists."""
+    if isinstance(value, Mapping):
+        return {name: plain(v) for name, v in value.items()}
+    if isinstance(value, float):
+        return value if math.isfinite(value) else str(value)
+    return [plain(v) for v in value] if isinstance(value, list | tuple) else value
+
+
+@contextlib.contextmanager
+def progress(wanted: bool) -> Iterator[Callable[[str, str, float], None] | None]:
+    """Show progress bars on stderr, where that is a terminal.
+
+    Gives a function of a name, what is being done and the share in [0, 1] that is done; a bar for each name. Gives
+    None where no bar is wanted or possible.
+    """
+    if not wanted or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"),
+               TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        tasks: dict[str, Any] = {}
+
+        def report(name: str, what: str, share: float) -> None:
+            if name not in tasks:
+                tasks[name] = bar.add_task(name, total=1.0)
+            bar.update(tasks[name], completed=share, description=f"{name}  {what}")
+
+        yield report
+
+
+def of_one(report: Callable[[str, str, float], None] | None, name: str) -> Callable[[str, float], None] | None:
+    """The progress of one named piece of work: a function of what is being done and its share, None without a bar."""
+    return None if report is None else lambda what, share: report(name, what, share)
+
+
+def plots_into(folder: Path) -> None:
+    """Make the folder for plots before the work begins, not after it.
+
+    Raises UnsupportedError where matplotlib is missing, FileError where the folder cannot be made.
+    """
+    from whitefurnace import plot_style
+    from whitefurnace.errors import FileError
+
+    plot_style.require()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileError(f"{folder}: cannot be made: {error.strerror}") from None
