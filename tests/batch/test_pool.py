@@ -607,7 +607,7 @@ def test_content_is_sent_by_value_where_asked(cluster):
 
 def test_without_dask_one_sentence_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(UnsupportedError, match=r"pip install 'whitefurnace\[dask\]'") as caught:
+    with pytest.raises(UnsupportedError, match=r'pip install "whitefurnace\[dask\]"') as caught:
         pool.run(STAGES, [Job("a")], scheduler="tcp://127.0.0.1:8786", on_result=print)
     assert "\n" not in str(caught.value) and caught.value.exit_code == 5
 

@@ -369,7 +369,7 @@ def test_bc6h_is_encoded_by_ispc_texcomp():
 
 def test_bc6h_without_its_encoder_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ispc_texcomp", None)
-    with pytest.raises(UnsupportedError, match=r"pip install 'whitefurnace\[bc6h\]'"):
+    with pytest.raises(UnsupportedError, match=r'pip install "whitefurnace\[bc6h\]"'):
         encode("bc6hu", [np.ones((4, 4, 3))])
 
 

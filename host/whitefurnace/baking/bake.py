@@ -30,6 +30,7 @@ from whitefurnace.files import (
     is_safe,
     lock_path,
     read_manifest,
+    require_encoder,
     write_manifest,
 )
 from whitefurnace.integrals.quadrature import dfg
@@ -409,6 +410,9 @@ def _read(request: Order, k: int, device: Device | str | None, lock: Lock | None
         shown, notices = _would_read(request, env, device, on)
         return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, (*env.notices, *notices),
                      as_read=shown, programs=_programs(request, env))
+    for engine in request.engines:
+        for file in engine.file:
+            require_encoder(file.stored)  # before minutes of work, not when the file is written
     lock.note([*files, path, path.with_name(f"{name}.probe")])
     for folder in sorted({request.output, *(file.parent for file in files)}):
         _check_writable(folder, name)

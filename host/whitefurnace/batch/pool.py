@@ -634,8 +634,8 @@ def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: C
                 tell: Callable[[str], None], interrupts: _Interrupts) -> None:
     try:
         import distributed
-    except ImportError as error:
-        raise UnsupportedError("a scheduler needs Dask: pip install 'whitefurnace[dask]'") from error
+    except ImportError:
+        raise UnsupportedError('a scheduler needs Dask: pip install "whitefurnace[dask]"') from None
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:

@@ -84,11 +84,14 @@ def scene(file: Path, output: Path | None, job: Path | None, for_: str, environm
     """List which textures and tables the materials of a glTF scene need, bake only those, and say what that saves."""
     from whitefurnace.advice import needs as deciding
     from whitefurnace.engines.presets import engines as named
+    from whitefurnace.files import require_encoder
     from whitefurnace.scenes import materials as reading
 
     _check_options(output, job, environments, tolerance)
     engine = deciding.one_engine(named(for_))
     found = reading.read_scene(file)
+    for one in engine.file if environments and job is None else ():
+        require_encoder(one.stored)
     needs = deciding.needs(found, engine, background=background)
     scaled = pixel is not None or resolution is not None or bool(media)
     inside, covered = _inside(found, pixel, resolution, media) if scaled else ((), None)

@@ -3,7 +3,7 @@ first needed: it takes longer to load than `--help` may."""
 
 from whitefurnace.files.arrays import is_arrays, read_header, read_npy, read_npz
 from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
-from whitefurnace.files.codec import decode, encode
+from whitefurnace.files.codec import decode, encode, require_encoder
 from whitefurnace.files.containers import is_texture, read_texture, write_texture
 from whitefurnace.files.env import EnvMap, read_env, write_env
 from whitefurnace.files.exr import write_exr
@@ -70,6 +70,7 @@ __all__ = [
     "read_stored",
     "read_texture",
     "release",
+    "require_encoder",
     "scratch",
     "srgb_table",
     "stored_format",

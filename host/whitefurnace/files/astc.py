@@ -22,7 +22,7 @@ def encode_astc(values: npt.ArrayLike, *, quality: float = QUALITY) -> Packed:
     installed."""
     if not 0 <= quality <= 100:
         raise UnsupportedError(f"a quality of {quality:g} of ASTC is not between 0 and 100")
-    astc = _library()
+    astc = library()
     array = np.asarray(values)
     if array.ndim < 3 or array.shape[-1] not in (3, 4):
         raise ValueError(f"values of shape {array.shape} are not (..., height, width, 3 | 4)")
@@ -42,7 +42,7 @@ def encode_astc(values: npt.ArrayLike, *, quality: float = QUALITY) -> Packed:
 def decode_astc(data: bytes | memoryview, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
     """The blocks `data` as float32 (*shape, 4), `shape` (..., height, width) in texels; blocks that are not valid are
     NaN, as on a GPU. Raises `UnsupportedError` where astc-encoder-py is not installed."""
-    astc = _library()
+    astc = library()
     height, width = shape[-2:]
     size = -(-height // SIDE) * -(-width // SIDE) * FORMATS["astc4x4hdr"].size
     blocks = memoryview(data).cast("B")
@@ -66,10 +66,10 @@ def _context(astc: Any, quality: float, flags: int) -> Any:
     return astc.ASTCContext(config)
 
 
-def _library() -> Any:
+def library() -> Any:
+    """The codec's module. Raises `UnsupportedError` with the sentence that names the extra where it is missing."""
     try:
         import astc_encoder
-    except ImportError as error:
-        raise UnsupportedError("ASTC is encoded and decoded by astc-encoder-py, which is not installed: "
-                               "pip install 'whitefurnace[astc]'") from error
+    except ImportError:
+        raise UnsupportedError('ASTC needs astc-encoder-py: pip install "whitefurnace[astc]"') from None
     return astc_encoder

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -24,11 +24,7 @@ def encode_bc6h(values: npt.ArrayLike, *, profile: Profile = "slow") -> Packed:
     both are counted. Raises `InputError` for NaN, `UnsupportedError` where ispc-texcomp is not installed."""
     if profile not in get_args(Profile):
         raise UnsupportedError(f"there is no profile {profile!r} of BC6H; known: {', '.join(get_args(Profile))}")
-    try:
-        import ispc_texcomp
-    except ImportError as error:
-        raise UnsupportedError("BC6H is encoded by ispc-texcomp, which is not installed: "
-                               "pip install 'whitefurnace[bc6h]'") from error
+    ispc_texcomp = library()
     array = np.asarray(values)
     if array.ndim < 3 or array.shape[-1] != 3:
         raise ValueError(f"values of shape {array.shape} are not (..., height, width, 3)")
@@ -47,6 +43,15 @@ def encode_bc6h(values: npt.ArrayLike, *, profile: Profile = "slow") -> Packed:
     ]
     shape = (*array.shape[:-3], (height + down) // SIDE, (width + across) // SIDE, 16)
     return Packed(np.frombuffer(b"".join(blocks), np.uint8).reshape(shape), halves.clipped, negative)
+
+
+def library() -> Any:
+    """The encoder's module. Raises `UnsupportedError` with the sentence that names the extra where it is missing."""
+    try:
+        import ispc_texcomp
+    except ImportError:
+        raise UnsupportedError('writing BC6H needs ispc-texcomp: pip install "whitefurnace[bc6h]"') from None
+    return ispc_texcomp
 
 
 def decode_bc6h(form: str, data: bytes | memoryview, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:

@@ -24,6 +24,22 @@ class Encoded:
     negative: tuple[int, ...]
 
 
+def require_encoder(form: str) -> None:
+    """Check that this machine can write the pixel format `form`, before anything is computed for it.
+
+    Raises `UnsupportedError` with the sentence that names the extra: for "bc6hu" without ispc-texcomp, for
+    "astc4x4hdr" without astc-encoder-py. Other formats need no package.
+    """
+    if form == "bc6hu":
+        from whitefurnace.files.bc6h import library  # loaded when needed
+
+        library()
+    elif form == ASTC:
+        from whitefurnace.files.astc import library
+
+        library()
+
+
 def encode(
     form: str,
     levels: Sequence[npt.ArrayLike],

@@ -97,7 +97,8 @@ def compare(a: Contents, b: Contents, *, axes_a: str | None = None, axes_b: str 
         notices.append(f"{a.path.name if a.holds == 'sheen' else b.path.name} holds Charlie's lobe, the other does not")
     for found in (a, b):
         if not found.levels and found.sh is None and found.irradiance is None:
-            raise UnsupportedError(f"{found.path} holds no levels and no table to compare")
+            raise UnsupportedError(f"{found.path}: {found.notices[0]}" if found.notices else
+                                   f"{found.path} holds no levels and no table to compare")
     rows: list[Row] = []
     if _is_sphere(a) and _is_sphere(b) and a.levels and b.levels:
         rows += _levels(a, b, notices)

@@ -190,8 +190,7 @@ def library() -> Any:
     try:
         import pygltflib
     except ImportError:
-        raise UnsupportedError("scenes are read with pygltflib, which is not installed: "
-                               "pip install whitefurnace[scene]") from None
+        raise UnsupportedError('scenes need pygltflib: pip install "whitefurnace[scene]"') from None
     return pygltflib
 
 
