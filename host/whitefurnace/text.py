@@ -5,7 +5,10 @@ from collections.abc import Iterable, Sequence
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """A plain table with aligned columns; the first `left` of them to the left, the rest to the right."""
+    """Set `rows` below `head` in aligned columns, indented by two spaces.
+
+    The first `left` columns are aligned to the left, the others to the right. Every row has as many cells as `head`.
+    """
     cells = [list(head), *[list(row) for row in rows]]
     widths = [max(len(row[k]) for row in cells) for k in range(len(head))]
     lines = []
@@ -16,7 +19,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> 
 
 
 def size(nbytes: float) -> str:
-    """Bytes for people."""
+    """A number of bytes as text with three digits and a decimal unit: 12 B, 3.4 KB, 56.7 MB, 8.9 GB."""
     for unit in ("B", "KB", "MB"):
         if nbytes < 1000:
             return f"{nbytes:.0f} {unit}" if unit == "B" else f"{nbytes:.3g} {unit}"

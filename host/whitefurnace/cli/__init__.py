@@ -42,12 +42,12 @@ _add_commands()
 
 
 def _abandon_stdout() -> None:
-    """What is left to be flushed goes nowhere, so that Python's own flush at exit does not complain."""
+    """Send what is still to be flushed to the null device, so that Python's own flush at exit does not fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def main(argv: list[str] | None = None) -> None:
-    """Entry point: runs the command and turns every error into one sentence and its exit code."""
+    """Run a command line and exit: every error becomes one sentence on stderr and its exit code."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without ² or × shows a ?, not a traceback

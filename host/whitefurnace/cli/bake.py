@@ -135,7 +135,7 @@ def print_baked(baked: Baked, output: Path, as_json: bool, quiet: bool) -> None:
 
 
 def baked_text(baked: Baked, output: Path) -> str:
-    """What a bake wrote, with the statement of every level."""
+    """The text of a bake: a row for each level with its errors, then the files."""
     if baked.state == "skipped":
         return f"{baked.name}: up to date, nothing to do ({output / (baked.name + '.json')})"
     if baked.state == "planned":
@@ -184,7 +184,7 @@ def baked_text(baked: Baked, output: Path) -> str:
 
 
 def _format_text(entry: Mapping[str, Any]) -> str:
-    """A file's pixel format and what it costs, beside the error of what it holds."""
+    """The pixel format of a file, the error of its contents, and the error that the format adds."""
     if "format" not in entry:
         return ""
     levels = entry.get("levels", ())
@@ -205,7 +205,7 @@ def _first(manifest: Mapping[str, Any]) -> int:
 
 
 def planned_text(baked: Baked) -> str:
-    """What a bake would do."""
+    """The text of a planned bake: levels, files, and the kernel programs it would compile."""
     several = len({names for names, _ in baked.plan}) > 1
     rows = [[f"specular of {', '.join(names)}" if several else f"specular {k}", f"{p.size}²", f"{p.roughness:.3f}",
              f"{p.grid}²" if p.grid else f"{p.samples} samples" if p.samples else "texel mean", f"{p.pairs:.2g}",
@@ -223,7 +223,7 @@ AS_READ = ("between", "texels", "levels", "format", "all")
 
 
 def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What engines show of chains, part by part; parts that none of them measured are left out."""
+    """The table of total errors after the engines' sampling, by part; parts that no chain measured have no column."""
     if not found:
         return []
     parts = [part for part in AS_READ if any(part in read["parts"] for read in found)]
@@ -240,7 +240,7 @@ def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def baked_rows(baked: Baked) -> list[dict[str, Any]]:
-    """JSON rows of a bake: one a level, then one for the whole."""
+    """JSON rows of a bake: one for each level, then one for the whole."""
     rows: list[dict[str, Any]] = []
     if baked.state == "planned":
         rows += [{"event": "level", "name": baked.name, "level": k, "for": list(names), "size": p.size,

@@ -178,7 +178,7 @@ def result_row(result: Result) -> dict[str, Any]:
 
 
 def result_text(result: Result) -> str:
-    """One line of an item; nothing of what is up to date or failed, which the summary tells. Of a plan, its files."""
+    """The text of an item: one line, with its files if it is planned; empty if it was skipped or failed."""
     if result.state == "done":
         error = "" if result.error is None else f", error {result.error:.1e}"
         return f"{result.place}: {size(result.nbytes)}{error}, {sum(result.seconds.values()):.2f} s"
@@ -192,25 +192,25 @@ def result_text(result: Result) -> str:
 
 
 def rate_text(tally: Tally) -> str:
-    """Items a second, and failures so far."""
+    """The items per second and the failures so far."""
     failed = f", {len(tally.failed)} failed" if tally.failed else ""
     return f"{tally.count / max(tally.wall, 1e-9):.3g}/s{failed}"
 
 
 def failures_text(tally: Tally) -> list[str]:
-    """Every failure with its reason."""
+    """A line for each failure with its reason."""
     return [f"failed: {result.place}: {result.message} (exit code {result.exit_code})" for result in tally.failed]
 
 
 def tally_text(tally: Tally) -> str:
-    """The last line of a batch."""
+    """The summary of a batch in one line."""
     states = {"done": "done", "planned": "to do", "skipped": "up to date", "failed": "failed"}
     if tally.total and tally.states["skipped"] == tally.total:
         return f"{tally.total} items, all up to date: nothing to do; {tally.wall:.2f} s"
-    told = [f"{tally.states[state]} {text}" for state, text in states.items() if tally.states[state]]
+    counts = [f"{tally.states[state]} {text}" for state, text in states.items() if tally.states[state]]
     left = tally.total - tally.count
-    told += [f"{left} not begun"] if left else []
-    line = f"{tally.total} items: {', '.join(told) or 'none'}; {size(tally.nbytes)}"
+    counts += [f"{left} not begun"] if left else []
+    line = f"{tally.total} items: {', '.join(counts) or 'none'}; {size(tally.nbytes)}"
     if tally.states["planned"]:
         return line + f", about {tally.predicted['cpu_seconds']:.2g} s of processor time, " \
                       f"{size(tally.predicted['memory'])} of memory a worker"
@@ -218,7 +218,7 @@ def tally_text(tally: Tally) -> str:
 
 
 def tally_row(tally: Tally) -> dict[str, Any]:
-    """The last JSON row of a batch, with every failure."""
+    """The JSON row of the summary, with every failure."""
     return {"event": "summary", "items": tally.total, **tally.states, "bytes": tally.nbytes, "wall": tally.wall,
             "seconds": tally.seconds, **({"predicted": tally.predicted} if tally.states["planned"] else {}),
             "failures": [{"place": r.place, "message": r.message, "exit_code": r.exit_code} for r in tally.failed]}

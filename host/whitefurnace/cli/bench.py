@@ -93,7 +93,7 @@ def bench(words: tuple[str, ...], runs: int | None, size: int | None, min_size: 
 
 def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | None, folder: Path | None,
               device: str | None, dry_run: bool, as_json: bool) -> None:
-    """Measure error against time on every environment, and on the first what makes a level expensive."""
+    """Measure error against time on every environment, and on the first one the cost of sizes and roughness."""
     from whitefurnace.benching import tradeoff
     from whitefurnace.opencl.device import choose_device
 
@@ -146,26 +146,26 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
 
 
 def _spread(spread: Spread, factor: float, digits: int = 3) -> tuple[str, str]:
-    """Median, and (least … largest), times a factor."""
+    """The median times a factor as text, and the range as (least … largest)."""
     median, low, high = (f"{float(f'{x * factor:.{digits}g}'):g}" for x in (spread.median, spread.low, spread.high))
     return median, f"({low} … {high})"
 
 
 def cases_text(cases: Sequence[Case], flops: Mapping[str, float]) -> str:
-    """What can be measured."""
+    """The table of the cases that can be measured."""
     return table(["case", "kernel", "what", "counted in", "flops"],
                  [[c.name, c.kernel, c.about, f"{c.unit}s", f"{flops[c.name]:g}" if c.name in flops else ""]
                   for c in cases], left=4)
 
 
 def case_rows(cases: Sequence[Case], flops: Mapping[str, float]) -> list[dict[str, Any]]:
-    """JSON rows of what can be measured."""
+    """JSON rows of the cases that can be measured."""
     return [{"event": "planned", "case": c.name, "kernel": c.kernel, "about": c.about, "unit": c.unit,
              "flops": flops.get(c.name), "precisions": list(c.precisions)} for c in cases]
 
 
 def bench_text(rows: Sequence[Throughput], yardstick: Yardstick, device: str) -> str:
-    """The throughput of kernels beside what the device can do."""
+    """The throughput of kernels, below the limits of the device."""
     can = [[f"multiply-adds, float{p}", *_spread(s, 1), "GFLOP/s"] for p, s in yardstick.peak.items()]
     can += [[what, *_spread(s, 1), "GB/s"] for what, s in (("memory read", yardstick.read),
                                                            ("memory triad", yardstick.triad))]
@@ -186,7 +186,7 @@ def bench_row(row: Throughput) -> dict[str, Any]:
 
 
 def yardstick_row(yardstick: Yardstick, device: Mapping[str, str]) -> dict[str, Any]:
-    """The JSON row of what the device can do."""
+    """The JSON row of the limits of the device."""
     return {"event": "yardstick", "device": dict(device),
             "gflops": {f"float{p}": _three(s) for p, s in yardstick.peak.items()},
             "read_gbytes": _three(yardstick.read), "triad_gbytes": _three(yardstick.triad)}
@@ -197,7 +197,7 @@ def _three(spread: Spread) -> dict[str, float]:
 
 
 def tradeoff_text(points: Sequence[Point], missed: Sequence[Missed] = ()) -> str:
-    """Error against time on one environment."""
+    """The table of error against time on one environment."""
     name = (points[0] if points else missed[0]).environment
     cells = [[p.method, p.label, *_spread(p.seconds, 1e3), f"{1e3 * p.certificate:.3g}", f"{p.error:.1e}",
               f"{p.worst:.1e}", f"{p.rmse:.1e}", "front" if p.front else ""] for p in points]
@@ -206,7 +206,7 @@ def tradeoff_text(points: Sequence[Point], missed: Sequence[Missed] = ()) -> str
 
 
 def costs_text(costs: Sequence[Cost], tolerance: float, missed: Sequence[Missed] = ()) -> str:
-    """What makes a level dear."""
+    """The table of what a level costs by size, source size and roughness."""
     name = (costs[0] if costs else missed[0]).environment
     return "\n".join([f"cost at {tolerance:g} on {name}",
                       table(["over", "value", "ms", "(min … max)"],
@@ -218,7 +218,7 @@ def _missed(missed: Sequence[Missed]) -> list[str]:
 
 
 def tradeoff_rows(found: Sequence[Point | Missed | Cost]) -> list[dict[str, Any]]:
-    """JSON rows of points, of those that could not be made, and of costs."""
+    """JSON rows of measured points, of settings that could not be measured, and of costs."""
     rows = []
     for one in found:
         row = {**vars(one), "event": type(one).__name__.lower()}

@@ -75,7 +75,7 @@ def compare(a: Path, b: Path, folder: Path | None, max_error: float | None, axes
 
 
 def compared_text(found: Comparison) -> str:
-    """A is off from B by so much, part by part."""
+    """The table of the errors of A against B, a row for each part."""
     rows = [[row.part, row.size, "" if row.roughness is None else f"{row.roughness:.3f}", f"{row.error:.1e}",
              f"{row.worst:.1e}", "" if row.rmse is None else f"{row.rmse:.1e}",
              "" if row.stated is None else f"{row.stated:.1e}", row.method, row.at] for row in found.rows]

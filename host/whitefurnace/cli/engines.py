@@ -42,14 +42,14 @@ def engines(name: str | None, as_toml: bool, as_json: bool) -> None:
 
 
 def engines_text(engines: Sequence[Engine]) -> str:
-    """The engines that `--for` knows, a row each."""
+    """The table of the engines that `--for` knows."""
     rows = [[e.name, e.title.partition(": ")[0], "seen" if e.proven else "", e.lods_text, e.sh or "",
              "" if e.container != "files" else f"{e.dfg.size}² {e.dfg.form}"] for e in engines]
     return table(["engine", "of", "proven", "lod(r)", "harmonics", "table"], rows, left=6)
 
 
 def engine_text(engine: Engine) -> str:
-    """One engine: its files and how they are read."""
+    """The text of one engine: its files and how it reads them."""
     lines = [f"{engine.name}: {engine.title}", f"  facts      {engine.facts}",
              f"  lod(r)     {engine.lods_text}" + (", past r = 1 a lobe of that α" if engine.follow else ""),
              f"  sizes      {engine.size}², " + (f"{engine.levels} levels" if engine.levels else

@@ -40,7 +40,7 @@ def inspect(file: Path, as_json: bool) -> None:
 
 
 def inspect_text(row: Mapping[str, Any]) -> str:
-    """What is in a file, from the row of `contents.described`."""
+    """The text of a file's contents. `row` is that of `contents.described`."""
     lines = [f"{row['file']}: {row['kind']} in {row['container']}, {row['format']}"]
     header = {**row["header"], **({"bytes": size(row["header"]["bytes"])} if "bytes" in row["header"] else {})}
     for name in ("layers", "orientation"):
@@ -68,24 +68,24 @@ def inspect_text(row: Mapping[str, Any]) -> str:
 def _inspected(level: Mapping[str, Any]) -> list[str]:
     count = {name: level[name] for name in ("nan", "infinite", "negative", "at_limit") if level[name]}
     names = {"nan": "NaN", "infinite": "infinite", "negative": "negative", "at_limit": "at the format's limit"}
-    said = [f"{value} {names[name]}" for name, value in count.items()]
-    said += [f"alpha {level['alpha'][0]:.3g} … {level['alpha'][1]:.3g}"] if level["alpha"] else []
+    notes = [f"{value} {names[name]}" for name, value in count.items()]
+    notes += [f"alpha {level['alpha'][0]:.3g} … {level['alpha'][1]:.3g}"] if level["alpha"] else []
     mean, added = level["mean"], level.get("format_p99", level.get("format_worst"))
     return [level["name"], level["size"],
             "" if level["roughness"] is None else f"{level['roughness']:.3f}",
             "" if level["bytes"] is None else size(level["bytes"]), f"{level['low']:.3g}",
             " ".join(f"{x:.3g}" for x in mean), f"{level['high']:.4g}",
             f"{level['error']:.1e}" if "error" in level else "",
-            "" if added is None else f"{added:.1e}", ", ".join(said)]
+            "" if added is None else f"{added:.1e}", ", ".join(notes)]
 
 
 def _stated(statement: Mapping[str, Any] | None) -> list[str]:
-    """What a manifest or our attributes say of a file."""
+    """Lines with what a manifest or the attributes of whitefurnace state about a file."""
     if statement is None:
         return ["  no manifest lists it, and it states no error"]
-    told = []
+    lines = []
     if statement["manifest"] is not None:
-        told.append(f"  manifest {statement['manifest']}: " + (
+        lines.append(f"  manifest {statement['manifest']}: " + (
             "the digests match" if statement["whole"] else "what it lists is NOT what is there, it was changed since"))
     version = statement.get("whitefurnace", statement.get("version"))
     key = statement.get("key")
@@ -95,21 +95,21 @@ def _stated(statement: Mapping[str, Any] | None) -> list[str]:
     made += [f"for {statement['engine']}"] if statement.get("engine") else []
     made += [f"on {device.get('name')}"] if isinstance(device, Mapping) else []
     if made:
-        told.append(f"  made by {', '.join(made)}")
+        lines.append(f"  made by {', '.join(made)}")
     recipe = statement.get("recipe")
     if isinstance(recipe, Mapping):
         shown = {name: _short(value) for name, value in recipe.items() if value is not None}
-        told.append("  recipe " + ", ".join(f"{name} {value if len(value) <= 60 else value[:60] + '…'}"
+        lines.append("  recipe " + ", ".join(f"{name} {value if len(value) <= 60 else value[:60] + '…'}"
                                             for name, value in shown.items()))
     if isinstance(statement.get("integral"), str):
         error = statement.get("error")
-        told.append(f"  integral {statement['integral']}" + (
+        lines.append(f"  integral {statement['integral']}" + (
             f", error {error:.1e}" if isinstance(error, float) else ""))
-    return told
+    return lines
 
 
 def _short(value: Any) -> str:
-    """A value of a recipe on one line; what a model is called, where it is one."""
+    """A value of a recipe on one line; a model is shown by its name."""
     if isinstance(value, Mapping):
         return str(value["name"]) if "name" in value else "/".join(f"{k}={_short(v)}" for k, v in value.items())
     if isinstance(value, list | tuple):

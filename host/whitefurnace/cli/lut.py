@@ -136,30 +136,30 @@ def print_table(made: Table, as_json: bool, quiet: bool) -> None:
         click.echo(table_text(made))
 
 
-def table_text(table: Table) -> str:
-    """What `lut` wrote or would write."""
-    name, beside = table.path, table.path.with_name(table.path.name + ".json")
-    if table.state == "skipped":
+def table_text(made: Table) -> str:
+    """The text of a table that was written, skipped or planned."""
+    name, beside = made.path, made.path.with_name(made.path.name + ".json")
+    if made.state == "skipped":
         return f"{name}: up to date, nothing to do ({beside})"
-    m = table.manifest
+    m = made.manifest
     recipe = m.get("recipe", m)
-    shape = " × ".join(str(n) for n in table.shape)
+    shape = " × ".join(str(n) for n in made.shape)
     of = ", ".join(c["name"] for c in recipe["models"].values()) or recipe["scheme"]
     lines = [f"{name}: {recipe['integral']}, {of}"
              f"; array of {shape}, float{recipe['precision']}"]
-    lines += [f"  {axis}  {along}" for axis, along in zip("xyzuvw", table.axes, strict=False)]
-    if table.state == "planned":
-        return "\n".join([*lines, f"  would write {name}  {size(table.nbytes)} before compression",
+    lines += [f"  {axis}  {along}" for axis, along in zip("xyzuvw", made.axes, strict=False)]
+    if made.state == "planned":
+        return "\n".join([*lines, f"  would write {name}  {size(made.nbytes)} before compression",
                           f"  would write {beside}  the manifest"])
     lines += _stated_lines(m)
     where = f"on {m['device']['name']} ({m['device']['platform']})" if "device" in m else "in numpy"
     done = f"  error {m['error']:.1e}, rule {m['rule']}, {m['evaluations']:.2g} evaluations, {where}"
     return "\n".join([*lines, done,
-                      f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {table.seconds:.2f} s"])
+                      f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {made.seconds:.2f} s"])
 
 
 def _stated_lines(m: Mapping[str, Any]) -> list[str]:
-    """What a manifest says of a table beside its error."""
+    """Lines with what a manifest states about a table besides its error."""
     lines = []
     if "channels" in m:
         lines.append(f"  channels  {', '.join(m['channels'])}")
@@ -172,11 +172,11 @@ def _stated_lines(m: Mapping[str, Any]) -> list[str]:
                   "  off Kulla and Conty's at F0 = " +
                   ", ".join(f"{f0}: {off:.1e}" for f0, off in m["deviation"].items())]
     if "misplaced" in m:
-        told = {f"at texels, {k}": e for k, e in m["misplaced"].items() if k != "between"}
-        told |= {f"between, {k}": e for k, e in m["misplaced"].get("between", {}).items()}
+        misplaced = {f"at texels, {k}": e for k, e in m["misplaced"].items() if k != "between"}
+        misplaced |= {f"between, {k}": e for k, e in m["misplaced"].get("between", {}).items()}
         names = ("mean", "median", "p99", "max")
         lines.append(table(["  energy misplaced", *names],
-                           [(f"  {where}", *(f"{e[k]:.3f}" for k in names)) for where, e in told.items()]))
+                           [(f"  {where}", *(f"{e[k]:.3f}" for k in names)) for where, e in misplaced.items()]))
     if "as_read" in m:
         read = m["as_read"]
         rows = [(name, *(f"{e[k]:.1e}" for k in ("p99", "max", "max_all"))) for name, e in
@@ -185,8 +185,8 @@ def _stated_lines(m: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def table_row(table: Table) -> dict[str, Any]:
+def table_row(made: Table) -> dict[str, Any]:
     """The JSON row of a table."""
-    return {"event": table.state, "file": str(table.path), "shape": list(table.shape), "seconds": table.seconds,
-            **{name: value for name, value in table.manifest.items() if name not in ("whitefurnace", "name")},
-            "notices": list(table.notices)}
+    return {"event": made.state, "file": str(made.path), "shape": list(made.shape), "seconds": made.seconds,
+            **{name: value for name, value in made.manifest.items() if name not in ("whitefurnace", "name")},
+            "notices": list(made.notices)}

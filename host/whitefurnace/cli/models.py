@@ -41,13 +41,13 @@ def models(name: str | None, as_json: bool) -> None:
 
 
 def models_text(entries: Sequence[Model]) -> str:
-    """The catalogue as a table."""
+    """The table of the catalogue."""
     rows = [[e.slot, e.name, e.title, ", ".join(_domains(e)), e.citation] for e in entries]
     return table(["slot", "name", "title", "parameters", "source"], rows, left=5)
 
 
 def _domains(entry: Model) -> list[str]:
-    """`NAME [low, high]` a parameter; the components of a vector as one, `NAME_x/y/z`, of any length."""
+    """`NAME [low, high]` for each parameter. The components of a vector of any length are one item, `NAME_x/y/z`."""
     found = []
     for p in entry.parameters:
         stem, _, axis = p.name.rpartition("_")
@@ -59,7 +59,7 @@ def _domains(entry: Model) -> list[str]:
 
 
 def model_text(entry: Model) -> str:
-    """All that the catalogue says of one model."""
+    """The text of one model: everything that its entry states."""
     from whitefurnace.catalogue.bibliography import PAPERS
 
     lines = [f"{entry.slot} {entry.name}: {entry.title}", f"  source      {PAPERS.get(entry.citation, entry.citation)}"]

@@ -140,7 +140,7 @@ def rendered_text(made: Rendered) -> str:
 
 
 def _values(value: Any) -> str:
-    """Of one number, or of RGB, once where they are the same."""
+    """A number, or RGB values; one number where all three are the same."""
     values = value if isinstance(value, tuple) else (value,)
     return " ".join(f"{x:.3g}" for x in (values[:1] if len(set(values)) == 1 else values))
 

@@ -196,7 +196,7 @@ def _tabulate(needs: Needs, output: Path, device: str | None, force: bool, as_js
 
 
 def scene_text(scene: Scene, needs: Needs) -> str:
-    """What is in a scene, and what it needs."""
+    """The text of a scene: its materials, and which parts of a bake they need."""
     box = scene.extent
     uses = sum(m.uses for m in scene.materials)
     head = [f"{len(scene.materials)} material{'' if len(scene.materials) == 1 else 's'} on {uses} "
@@ -229,7 +229,7 @@ def _saved(needs: Needs) -> str:
 
 
 def _spread_text(spread: Spread) -> str:
-    """A value, or its range over a texture with the mean."""
+    """A value, or its range over a texture with the mean, as text."""
     def one(values: Sequence[float]) -> str:
         return f"{values[0]:.3g}" if len(set(values)) == 1 else "/".join(f"{v:.3g}" for v in values)
 
@@ -240,15 +240,15 @@ def _spread_text(spread: Spread) -> str:
 
 
 def _also(m: Material) -> list[str]:
-    """What else is given of a material, in words."""
+    """Further values of a material that its file gives, as text."""
     core = ("base_color", "metalness", "roughness")
-    told = ["unlit"] if m.unlit else []
-    return told + [f"{name.replace('_', ' ')} {_spread_text(spread)}" for name, spread in m.values.items()
+    words = ["unlit"] if m.unlit else []
+    return words + [f"{name.replace('_', ' ')} {_spread_text(spread)}" for name, spread in m.values.items()
                    if name not in core and spread.given != "default"]
 
 
 def scene_rows(scene: Scene, needs: Needs) -> list[dict[str, Any]]:
-    """JSON rows: the scene, a material and a need each, and the whole."""
+    """JSON rows: the scene, each material, each need, and the whole."""
     def plain(x: float) -> float | None:
         return x if math.isfinite(x) else None  # an attenuation distance
 
@@ -269,7 +269,7 @@ def scene_rows(scene: Scene, needs: Needs) -> list[dict[str, Any]]:
 
 
 def media_text(found: Sequence[Inside], pixel: Pixel | None) -> str:
-    """What the media of a scene ask for at its scale."""
+    """The text of what the media of a scene need at its scale."""
     lines = [f"  inside, where {pixel.text}:" if pixel else "  inside:"]
     if not found:
         lines.append("    no material has a volume: give --medium [MATERIAL:]MEDIUM")
@@ -279,7 +279,7 @@ def media_text(found: Sequence[Inside], pixel: Pixel | None) -> str:
 
 
 def media_rows(found: Sequence[Inside], pixel: Pixel | None) -> list[dict[str, Any]]:
-    """JSON rows: a medium each."""
+    """A JSON row for each medium."""
     of = {"camera": pixel.of or None} if pixel else {}
     return [{"event": "medium", "material": one.material or None, "size_of": one.size_of or None,
              "reason": one.reason or None, "table": one.table, **of,
@@ -287,7 +287,7 @@ def media_rows(found: Sequence[Inside], pixel: Pixel | None) -> list[dict[str, A
 
 
 def budget_text(found: Budget, choice: Choice | None = None) -> str:
-    """What each approximation costs a scene in an environment, and what stays within a tolerance."""
+    """The text of each approximation's error on a scene in one environment, and of the bake that was chosen."""
     rows = [*(e for e in found.entries if e.used), found.files, found.floor, found.whole]
     head = [f"  errors of reflected radiance in {found.environment}, at {found.points} points of the scene's materials",
             table(["part", "", "rms", "p95", ""], [_entry_cells(e) for e in rows], left=5),
@@ -322,7 +322,7 @@ def _chosen_lines(found: Budget, choice: Choice | None) -> Iterable[str]:
 
 
 def budget_rows(found: Budget, choice: Choice | None = None) -> list[dict[str, Any]]:
-    """JSON rows: an approximation each, the whole, and the choice."""
+    """JSON rows: each approximation, the whole, and the choice."""
     def row(e: Entry) -> dict[str, Any]:
         return {"name": e.name, "kind": e.kind, "rms": e.rms, "p95": e.p95, "used": e.used, "bound": e.bound,
                 "what": e.what}

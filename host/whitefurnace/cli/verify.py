@@ -98,7 +98,7 @@ VERIFY_HEAD = (f"  {'check':<40} {'float':>5} {'value':>14} {'expected':>12} {'e
 
 
 def verify_text(rows: Sequence[Row]) -> str:
-    """The checks of one model, each with its worst cell, under `VERIFY_HEAD`; the counterexample of what failed."""
+    """Lines below `VERIFY_HEAD` for the checks of one model: the worst cell of each, and counterexamples."""
     lines = [f"{rows[0].slot} {rows[0].model}"]
     for row in rows:
         verdict = "FAIL" if not row.passed else "pass" if row.tolerance is not None else "told"
@@ -118,17 +118,17 @@ def _where(values: Mapping[str, Any], digits: str = ".4g") -> str:
 
 
 def verify_summary(rows: Sequence[Row], seconds: float, device: str) -> str:
-    """How many checks of how many models passed."""
-    told = sum(row.tolerance is None and row.passed for row in rows)
+    """The summary: the number of checks and models, and how many passed."""
+    informational = sum(row.tolerance is None and row.passed for row in rows)
     failed = sum(not row.passed for row in rows)
     subjects = len({(row.slot, row.model) for row in rows})
-    return (f"{len(rows) - told} checks of {subjects} {'model' if subjects == 1 else 'models'}: "
-            f"{len(rows) - told - failed} passed, {failed} failed"
-            + (f"; {told} figures told" if told else "") + f"; {seconds:.1f} s on {device}")
+    return (f"{len(rows) - informational} checks of {subjects} {'model' if subjects == 1 else 'models'}: "
+            f"{len(rows) - informational - failed} passed, {failed} failed"
+            + (f"; {informational} figures told" if informational else "") + f"; {seconds:.1f} s on {device}")
 
 
 def verify_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """JSON rows of checks; NaN and infinities as strings."""
+    """JSON rows of checks; NaN and infinities are strings."""
     return [{"event": "check", "slot": r.slot, "model": r.model, "check": r.check, "parameters": plain(r.parameters),
              "precision": r.precision, "value": plain(r.value), "expected": plain(r.expected),
              "error": plain(r.error), "tolerance": plain(r.tolerance), "passed": r.passed, "cells": r.cells,
