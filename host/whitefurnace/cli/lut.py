@@ -77,7 +77,7 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of t
                      "albedo_average.")
 @options.option("--brdf", metavar="FILE.clh", heading=MODELS,
                 help="A whole BRDF of your own, in RGB. Of albedo and albedo_average.")
-@options.light("Light source:", heading=LIGHT)
+@options.light("Light source", heading=LIGHT)
 @options.option("--environment", metavar="ENV", heading=LIGHT,
                 help="Environment image in place of a light, in RGB.")
 @options.option("--normal", metavar="X Y Z", type=float, nargs=3, heading=LIGHT,

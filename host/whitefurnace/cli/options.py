@@ -106,7 +106,7 @@ def fresnel_help(help: str) -> str:
 
 def light(help: str, *, multiple: bool = False, heading: str) -> Decorator:
     return option("--light", metavar="NAME[:p=v,...]", multiple=multiple, heading=heading,
-                  help=f"{help} punctual, ambient, disc or rectangle; `whitefurnace models NAME` lists its parameters.")
+                  help=f"{help}, a name from `whitefurnace models` with its parameters, as punctual:NoL=.5.")
 
 
 def tolerance(help: str, *, heading: str = "Accuracy") -> Decorator:

@@ -78,7 +78,7 @@ OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Truth beside the engine's picture
                 help=options.fresnel_help(" at metalness 1") + " [default: Schlick's of the base colour]")
 @options.option("--diffuse", metavar="NAME[:p=v,...]", heading=TRUTH,
                 help="Diffuse model, as oren_nayar:sigma=.5; see `whitefurnace models`. [default: lambert]")
-@options.light("Further light beside the environment; may be repeated:", multiple=True, heading=TRUTH)
+@options.light("Further light beside the environment (may be repeated)", multiple=True, heading=TRUTH)
 @options.device(TRUTH)
 @options.force("Overwrite FILE if it exists.")
 @options.as_json()
