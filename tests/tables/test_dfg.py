@@ -13,7 +13,7 @@ from whitefurnace import dfg, integrate, lut
 from whitefurnace.errors import UsageError
 from whitefurnace.opencl.device import Device
 from whitefurnace.tables import bilinear
-from whitefurnace.tables.lut import Axis, axis
+from whitefurnace.tables.axes import Axis, axis
 
 
 def pair_by_tanh_sinh(NoV: float, alpha: float) -> np.ndarray:

@@ -18,6 +18,9 @@ from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.opencl.device import Device
 from whitefurnace.tables import ltc
 from whitefurnace.tables import lut as tables
+from whitefurnace.tables.kinds import kind
+
+SCHEMES = kind("ltc").schemes
 
 SIZE = 24
 """Texels an edge of the tables of these tests: the means of 64² within .005, in a second."""
@@ -102,7 +105,7 @@ def made(device: Device, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     """Table and manifest of each scheme."""
     folder = tmp_path_factory.mktemp("ltc")
     found = {}
-    for scheme in ltc.SCHEMES:
+    for scheme in SCHEMES:
         told = lut("ltc", folder / f"{scheme}.npy", size=SIZE, scheme=scheme, device=device)
         found[scheme] = np.load(folder / f"{scheme}.npy"), told.manifest
     return found
@@ -111,7 +114,7 @@ def made(device: Device, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
 # ---------------------------------------------------------------------------------------------- distributions
 
 
-@pytest.mark.parametrize("scheme", ltc.SCHEMES)
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_a_constant_light_all_around_gives_one(made: Any, scheme: str) -> None:
     """Six polygons around the point, lit by the matrices as engines load them, hold all of every lobe; the five above
     the horizon all but what the closed form says is below. Any matrix integrates to 1, one of float32 too."""
@@ -136,7 +139,7 @@ def test_the_distribution_integrates_to_one(made: Any, y: int, x: int) -> None:
     assert (density(inverse(made["free"][0][y, x]), d) * w).sum() == pytest.approx(1, abs=1e-3)
 
 
-@pytest.mark.parametrize("scheme", ltc.SCHEMES)
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_misplaced_energy_is_what_is_stated(device: Device, made: Any, scheme: str) -> None:
     """m of single cells from f, p and E in NumPy on nodes about n; and the same from the device's own nodes."""
     table, _ = made[scheme]
@@ -192,7 +195,7 @@ def test_the_figures(made: Any) -> None:
 @pytest.mark.long
 def test_the_figures_of_64(device: Device, tmp_path: Path) -> None:
     told = {scheme: lut("ltc", tmp_path / f"{scheme}.npy", scheme=scheme, device=device).manifest
-            for scheme in ltc.SCHEMES}
+            for scheme in SCHEMES}
     assert told["free"]["shape"] == [64, 64, 8]
     assert told["free"]["misplaced"]["float32"]["mean"] <= 0.075  # .089 is asked, numerics' own L1 probe has .075
     assert told["heitz"]["misplaced"]["float32"]["mean"] <= 0.12
@@ -209,7 +212,7 @@ def test_along_the_normal_lobes_are_round(made: Any) -> None:
     assert row[some, 3] == pytest.approx(2 * alpha[0, some], rel=2e-2)
 
 
-@pytest.mark.parametrize("scheme", ltc.SCHEMES)
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_narrow_lobes_are_the_reflected_ellipse(made: Any, scheme: str) -> None:
     """α → 0: N maps the mirror direction to the pole at height 2α n·v, with N X = n·v along X = (n·v, 0, sin θ_v): half
     vectors tilt l by 2α in the plane of incidence and 2α n·v across it. Off by O(α/n·v)."""
@@ -322,10 +325,10 @@ def test_other_models_find_their_lobes(device: Device, tmp_path: Path, options: 
 
 
 def test_the_axes_of_engines(device: Device, tmp_path: Path) -> None:
-    usual = tables.order("ltc", tmp_path / "t.npy")
+    usual = tables.plan(tables.TableRequest("ltc", tmp_path / "t.npy"))
     assert usual.shape == (64, 64, 8) and [a.name for a in usual.axes] == ["roughness", "NoV"]
     assert usual.axes[1].values() == pytest.approx(1 - np.linspace(0, 1, 64) ** 2)
-    theta = tables.order("ltc", tmp_path / "t.npy", size="8x5", axes={"NoV": "angle"})
+    theta = tables.plan(tables.TableRequest("ltc", tmp_path / "t.npy", size="8x5", axes={"NoV": "angle"}))
     assert theta.shape == (5, 8, 8)
     assert theta.axes[1].values() == pytest.approx(np.cos(np.linspace(0, np.pi / 2, 5)))
     assert theta.axes[1].at(np.array([0.5]))[0] == pytest.approx(np.sqrt(0.5))
@@ -343,7 +346,7 @@ def test_the_axes_of_engines(device: Device, tmp_path: Path) -> None:
 ])
 def test_refusals(tmp_path: Path, options: dict[str, Any], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
-        tables.order("ltc", tmp_path / "t.npy", **options)
+        tables.plan(tables.TableRequest("ltc", tmp_path / "t.npy", **options))
 
 
 def test_the_command(device: Device, tmp_path: Path) -> None:
@@ -354,4 +357,4 @@ def test_the_command(device: Device, tmp_path: Path) -> None:
     row = json.loads((tmp_path / "t.npy.json").read_text("utf-8"))
     assert row["scheme"] == "heitz" and row["misplaced"]["float32"]["mean"] > 0
     with pytest.raises(UsageError, match="write ltc_1 and ltc_2"):
-        tables.order("ltc", tmp_path / "t.exr")
+        tables.plan(tables.TableRequest("ltc", tmp_path / "t.exr"))

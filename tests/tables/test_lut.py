@@ -22,7 +22,7 @@ from whitefurnace.catalogue import INTEGRALS
 from whitefurnace.catalogue.roughness import alpha_of_roughness
 from whitefurnace.errors import FileError, UsageError
 from whitefurnace.files import scratch, write_npy
-from whitefurnace.tables.lut import Axis, axis
+from whitefurnace.tables.axes import Axis, axis
 
 
 def centres(n: int) -> np.ndarray:

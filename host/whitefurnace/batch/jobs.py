@@ -28,6 +28,7 @@ from whitefurnace.opencl.device import device_address
 from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
 from whitefurnace.sphere.environments import extent, source_files
 from whitefurnace.tables import lut as tables
+from whitefurnace.tables.axes import named, named_axes
 
 MOST_BYTES = 16 << 20
 """Of a job file: ten thousand paths take about one."""
@@ -414,7 +415,7 @@ class _Maker:
             self.named[Path(options["environment"])] = None
         try:
             recipe = _recipe(options)
-            request = _table_order(recipe, table.kind, str(output), self.force)
+            request = _table_plan(recipe, table.kind, str(output), self.force)
             if request.nbytes > MOST_TABLE:
                 raise UsageError(f"a table of {request.nbytes} bytes; a job's have at most {MOST_TABLE}")
         except (FileError, InputError) as error:
@@ -547,12 +548,11 @@ def _bake_order(recipe: str, output: str, force: bool) -> baking.Order:
     return baking.order(["environment"], output, force=force, **options)
 
 
-def _table_order(recipe: str, kind: str, output: str, force: bool) -> tables.Order:
+def _table_plan(recipe: str, kind: str, output: str, force: bool) -> tables.TablePlan:
     options = json.loads(recipe)["options"]
     axes, fixed = options.pop("axis", []), options.pop("set", [])
-    axes = [f"NoV={one}" if one in tables.SCALES else one for one in axes]
-    return tables.order(kind, output, force=force, stored=options.pop("format", None), axes=tables.named("axis", axes),
-                        parameters=tables.named("set", fixed), **options)
+    return tables.plan(tables.TableRequest(kind, output, force=force, stored=options.pop("format", None),
+                                           axes=named_axes("axis", axes), parameters=named("set", fixed), **options))
 
 
 # ---------------------------------------------------------------------------------------------- doing
@@ -615,7 +615,7 @@ def compute(prepared: Prepared) -> Computed | Result:
     try:
         if item.kind == "lut":
             Path(item.output).parent.mkdir(parents=True, exist_ok=True)
-            table = tables.make(_table_order(item.recipe, item.source, item.output, item.force), item.device)
+            table = tables.make(_table_plan(item.recipe, item.source, item.output, item.force), item.device)
             return _of_table(item, table, {"compute": time.perf_counter() - begin})
         if loaded is None:
             found = baking.read(_one(item), 0, item.device)
@@ -748,7 +748,7 @@ def predict(item: Item) -> Result:
     try:
         _check_inside(item)
         if item.kind == "lut":
-            return _of_table(item, tables.make(_table_order(item.recipe, item.source, item.output, item.force),
+            return _of_table(item, tables.make(_table_plan(item.recipe, item.source, item.output, item.force),
                                                dry_run=True), {})
         order = _one(item)
         found = _of_baked(item, baking.status(order, 0), {})

@@ -1,7 +1,6 @@
 """`whitefurnace lut`: its options, what it prints and its JSON row."""
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,12 +8,13 @@ import click
 
 from whitefurnace.cli import options
 from whitefurnace.cli.terminal import print_row, progress, say
+from whitefurnace.tables.kinds import listed, schemes_listed
 from whitefurnace.text import size, table
 
 if TYPE_CHECKING:
     from whitefurnace.tables.lut import Table
 
-EPILOG = """\b
+EPILOG = f"""\b
 Examples:
   whitefurnace lut dfg -o dfg.npy --size 256
   whitefurnace lut dfg -o fitted.npy --size 64 --axis sqrt --fit bilinear
@@ -37,6 +37,10 @@ direction has one axis, r, as x.
 ndf_alpha for the alpha of the slot ndf. --axis NAME=A:B:N replaces the usual axis of that name, or adds a slower one.
 The first and last values are A and B, except on the scale `centres`. FILE.json beside FILE describes the table.
 
+\b
+Kinds:
+{listed()}
+
 Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported,
 7 a check failed, 130 interrupted.
 """
@@ -53,10 +57,7 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of t
 @options.option("--for", "for_", metavar="ENGINE", heading=OUTPUT,
                 help="Use the size, axes and form that an engine reads (see `whitefurnace engines`). Of dfg.")
 @options.option("--scheme", metavar="NAME", heading=OUTPUT,
-                help="Form of the table. dfg: scale_bias (the default) or multiscatter; energy: kulla_conty (the "
-                     "default), turquin or fdez_aguera; ltc: free (the default) or heitz; glass: entering (the "
-                     "default) or leaving; smith: rational (the default) or linear; diffusion: skin (the default), "
-                     "burley, dipole, or a medium, as marble.")
+                help=f"Form of the table, by default the first of its kind. {schemes_listed()}.")
 @options.option("--size", metavar="N|NxM", heading=AXES,
                 help="Number of cells along x and y, each 1 to 16384. [default: 128, 64 for ltc]")
 @options.option("--axis", "axes", metavar="NAME=A:B:N[:SCALE]", multiple=True, heading=AXES,
@@ -106,21 +107,17 @@ def lut(kind: str, output: Path, stored: str | None, for_: str | None, scheme: s
         force: bool, as_json: bool, quiet: bool) -> None:
     """Write a table of an integral over a grid of parameters.
 
-    KIND is normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance; energy, the energy of
-    multiple scattering; sheen, with the share that it leaves to the layer below; fresnel_average; glass, the light that
-    a rough boundary reflects and transmits; smith and norm, coefficients of fitted curves; diffusion, diffuse light on
-    skin and other media over NoL and curvature (1/radius in 1/mm); or ltc, linearly transformed cosines for polygonal
-    lights (ltc_1 and ltc_2 are its two textures).
+    KIND is what to tabulate, one of the kinds that are listed at the end.
     """
     from whitefurnace.tables import lut as tables
+    from whitefurnace.tables.axes import named, named_axes
 
-    axes = tuple(f"NoV={item}" if item in tables.SCALES else item for item in axes)
-    request = tables.order(
-        kind, output, stored=stored, for_=for_, scheme=scheme, size=size, axes=tables.named("--axis", axes),
-        parameters=tables.named("--set", fixed), backfacing=backfacing, ndf=ndf, masking=masking, fresnel=fresnel,
+    request = tables.plan(tables.TableRequest(
+        kind, output, stored=stored, for_=for_, scheme=scheme, size=size, axes=named_axes("--axis", axes),
+        parameters=named("--set", fixed), backfacing=backfacing, ndf=ndf, masking=masking, fresnel=fresnel,
         diffuse=diffuse, brdf=brdf, light=light, environment=environment, normal=normal, rotate=rotate,
         exposure=exposure, nonfinite=nonfinite, tolerance=tolerance, precision=precision, fit=fit, as_read=as_read,
-        force=force)
+        force=force))
     with progress(not (quiet or as_json)) as report:
         made = tables.make(request, device, dry_run=dry_run, progress=report)
     for notice in () if quiet else made.notices:
@@ -142,41 +139,28 @@ def table_text(made: Table) -> str:
     if made.state == "skipped":
         return f"{name}: up to date, nothing to do ({beside})"
     m = made.manifest
-    recipe = m.get("recipe", m)
     shape = " × ".join(str(n) for n in made.shape)
-    of = ", ".join(c["name"] for c in recipe["models"].values()) or recipe["scheme"]
-    lines = [f"{name}: {recipe['integral']}, {of}"
-             f"; array of {shape}, float{recipe['precision']}"]
+    lines = [f"{name}: {made.kind.name}, {made.subject}; array of {shape}, float{made.recipe['precision']}"]
     lines += [f"  {axis}  {along}" for axis, along in zip("xyzuvw", made.axes, strict=False)]
     if made.state == "planned":
         return "\n".join([*lines, f"  would write {name}  {size(made.nbytes)} before compression",
                           f"  would write {beside}  the manifest"])
-    lines += _stated_lines(m)
+    lines += _stated_lines(made)
     where = f"on {m['device']['name']} ({m['device']['platform']})" if "device" in m else "in numpy"
     done = f"  error {m['error']:.1e}, rule {m['rule']}, {m['evaluations']:.2g} evaluations, {where}"
     return "\n".join([*lines, done,
                       f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {made.seconds:.2f} s"])
 
 
-def _stated_lines(m: Mapping[str, Any]) -> list[str]:
+def _stated_lines(made: Table) -> list[str]:
     """Lines with what a manifest states about a table besides its error."""
-    lines = []
+    m, lines = made.manifest, []
     if "channels" in m:
         lines.append(f"  channels  {', '.join(m['channels'])}")
         lines += [f"  formula   {m['formula']}"] if "formula" in m else []
     if "stored" in m:
         lines += [f"  stored as {m['stored']['format']}: off by {m['stored']['error']:.1e} at most, beside the error"]
-    if "furnace" in m:
-        lines += [f"  furnace at F = 1: off by {m['furnace']:.1e}; "
-                  f"f(l, v) and f(v, l) differ by {m['non_reciprocity']:.2g}",
-                  "  off Kulla and Conty's at F0 = " +
-                  ", ".join(f"{f0}: {off:.1e}" for f0, off in m["deviation"].items())]
-    if "misplaced" in m:
-        misplaced = {f"at texels, {k}": e for k, e in m["misplaced"].items() if k != "between"}
-        misplaced |= {f"between, {k}": e for k, e in m["misplaced"].get("between", {}).items()}
-        names = ("mean", "median", "p99", "max")
-        lines.append(table(["  energy misplaced", *names],
-                           [(f"  {where}", *(f"{e[k]:.3f}" for k in names)) for where, e in misplaced.items()]))
+    lines += made.kind.lines(m)
     if "as_read" in m:
         read = m["as_read"]
         rows = [(name, *(f"{e[k]:.1e}" for k in ("p99", "max", "max_all"))) for name, e in

@@ -181,6 +181,7 @@ def _bake(needs: Needs, for_: str, environments: tuple[str, ...], output: Path, 
 def _tabulate(needs: Needs, output: Path, device: str | None, force: bool, as_json: bool, quiet: bool) -> None:
     """Write the tables that a scene needs beside its bakes. Raises FileError where the folder cannot be made."""
     from whitefurnace.tables import lut as tables
+    from whitefurnace.tables.axes import named
 
     if needs.tables:
         try:
@@ -190,8 +191,8 @@ def _tabulate(needs: Needs, output: Path, device: str | None, force: bool, as_js
     with progress(not (quiet or as_json)) as report:
         for one in needs.tables:
             own = {key: value for key, value in one.items() if key not in ("kind", "output", "set")}
-            request = tables.order(one["kind"], output / one["output"], force=force,
-                                   parameters=tables.named("--set", one.get("set", [])), **own)
+            request = tables.plan(tables.TableRequest(one["kind"], output / one["output"], force=force,
+                                                      parameters=named("--set", one.get("set", [])), **own))
             print_table(tables.make(request, device, progress=report), as_json, quiet)
 
 

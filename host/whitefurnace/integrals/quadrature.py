@@ -120,9 +120,9 @@ def _of_files(parts: Sequence[Part], flat: np.ndarray) -> Iterator[str]:
 
 
 @dataclass(frozen=True)
-class Demand:
-    """What `integrate` would do with the same arguments: the models by slot, the shape of `values` and the digests
-    of the kernels. `precision`, `tolerance`, `device`, `out` and `progress` are no part of it."""
+class TableSpec:
+    """What `integrate` would compute with the same arguments: the models by slot, the shape of `values` and the digests
+    of the kernels. `precision`, `tolerance`, `device`, `out` and `progress` do not change it."""
 
     entry: Integral
     slots: Mapping[str, Chosen]
@@ -130,9 +130,9 @@ class Demand:
     digests: tuple[str, ...]
 
 
-def demand(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
-           diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
-           **parameters: Any) -> Demand:
+def table_spec(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
+               diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
+               **parameters: Any) -> TableSpec:
     """The arguments of `integrate` checked, without a device. Raises what `integrate` raises of them."""
     entry = integral(name)
     _refuse_lit(entry)
@@ -143,7 +143,7 @@ def demand(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresn
     if "ndf" in slots and slots["ndf"].model.isotropic:
         digests.append(source.area(slots["ndf"].model).digest)  # of the table, should it be needed
     components = 3 if "brdf" in slots else entry.components
-    return Demand(entry, slots, shape if components == 1 else (*shape, components), tuple(digests))
+    return TableSpec(entry, slots, shape if components == 1 else (*shape, components), tuple(digests))
 
 
 def room_for(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.ndarray:

@@ -18,10 +18,10 @@ from whitefurnace.integrals.outlines import outline, panels
 from whitefurnace.integrals.quadrature import (
     DEFAULT_TOLERANCE,
     ROUNDING,
-    Demand,
     Grid,
     Part,
     Progress,
+    TableSpec,
     Tally,
     climb,
     grid_of,
@@ -125,13 +125,13 @@ def _chosen(light: Spec | None, ndf: Spec | None, masking: Spec, fresnel: Spec, 
     return slots
 
 
-def radiance_demand(*, light: Spec | None, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
-                    diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
-                    **parameters: Any) -> Demand:
-    """What `radiance` would do, as `run.demand` tells of the other integrals; without a light, for an environment."""
+def radiance_spec(*, light: Spec | None, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
+                  diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
+                  **parameters: Any) -> TableSpec:
+    """What `radiance` would compute, as `table_spec` for other integrals; without a light, for an environment."""
     entry, slots = integral("radiance"), _chosen(light, ndf, masking, fresnel, diffuse, brdf)
     shape = grid_of(entry, slots, dict(parameters), backfacing).shape
-    return Demand(entry, slots, (*shape, 3) if light is None or "brdf" in slots else shape, (source.everything(),))
+    return TableSpec(entry, slots, (*shape, 3) if light is None or "brdf" in slots else shape, (source.everything(),))
 
 
 def _fill(task: _Task, how: Callable[[_Task, int, int], np.ndarray], components: int,

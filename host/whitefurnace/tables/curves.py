@@ -15,11 +15,9 @@ from whitefurnace.errors import UnsupportedError
 from whitefurnace.files import number
 from whitefurnace.integrals.quadrature import integrate, missed, room_for
 from whitefurnace.opencl.derived import finest, numbers_of
-from whitefurnace.opencl.device import Device
 from whitefurnace.results import Integrated
-
-SCHEMES = ("rational", "linear")
-"""Of `smith`: a width k and a bend q that follow the roughness, or the width alone."""
+from whitefurnace.tables.axes import Axis, Ends, Points
+from whitefurnace.tables.cells import Cells, Run
 
 TERMS = 6
 """Coefficients of a polynomial in the roughness: GGX's k = α/2 is one of them, β² of others wants all."""
@@ -27,18 +25,11 @@ TERMS = 6
 DEGREES = range(1, 11)
 """Total degrees of a norm's polynomial, of which the least that meets the tolerance is taken."""
 
-NORM_TOLERANCE = 1e-2
-"""The usual relative error of a norm: a hundredth of D is less than an eye sees."""
-
 POWERS = (2, 4, 8, 16, 32, 64)
 """Of the sums |error|^p that are made small one after the other: the last is within 3 % of the largest error of 1e4
 points, with a derivative that the largest error has not."""
 
-SMITH_AXES: Mapping[str, tuple[float, float, int, str]] = {"roughness": (0.045, 1.0, 64, "linear"),
-                                                           "NoV": (0.0, 1.0, 96, "sqrt")}
-"""Where Smith's term is fitted: roughness from what engines shade with at least [Lagarde2014]."""
-
-NORM_AXES: Mapping[str, Mapping[str, tuple[float, float, int, str]]] = {
+NORM_AXES: Mapping[str, Mapping[str, Ends]] = {
     "abc": {"b": (1.0, 1e6, 48, "log"), "c": (1.0, 3.0, 48, "linear")},
     "shifted_gamma": {"alpha": (1e-3, 1.0, 48, "log"), "p": (0.0, 2.0, 48, "linear")},
 }
@@ -117,7 +108,7 @@ def smith_check(slots: Mapping[str, Chosen]) -> None:
         raise UnsupportedError(f"smith is of Smith's masking; {masking.name} is another")
 
 
-def shape_of_smith(scheme: str | None, axes: Sequence[Any]) -> tuple[int, ...]:
+def shape_of_smith(scheme: str | None, axes: Sequence[Axis]) -> tuple[int, ...]:
     """(polynomials, coefficients); one coefficient where nothing but n·v varies."""
     others = [axis.name for axis in axes if axis.name != "NoV"]
     if len(others) > 1 or len(others) == len(axes):
@@ -131,23 +122,22 @@ def area(scheme: str | None, c: np.ndarray, k: np.ndarray, q: np.ndarray) -> np.
     return c + k * (1 - c) * (q / (q + c) if scheme == "rational" else 1)
 
 
-def smith(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, out: np.ndarray | None,
-          precision: int, tolerance: float, device: Device, axes: Sequence[Any], columns_of: Callable[..., Any],
-          backfacing: str | None = None, **columns: Any) -> tuple[Integrated, dict[str, Any]]:
+def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, Any]]:
     """(polynomials, coefficients) of k, and q, in the parameter x: G1(c) = c/A(c), A = c + k(1 - c) q/(q + c).
 
     With q left out and k = α/2 it is Hammon's approximation of GGX's height-correlated term. [Hammon2017]
     """
     start = time.perf_counter()
+    ndf, axes, scheme = cells.models["ndf"], cells.axes, cells.scheme
     shape = shape_of_smith(scheme, axes)
     along = next((axis for axis in axes if axis.name != "NoV"), None)
 
-    def exact(share: Callable[[Any], np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    def exact(share: Callable[[Axis], np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
         """c, x and A at shares of the axes, flat, and evaluations."""
-        points = [(axis.name, axis.at(share(axis))[0]) for axis in axes]
-        made = integrate("projected_area", ndf=ndf, precision=finest(device), tolerance=1e-8, device=device,
-                         **columns_of(points))
-        values = dict(points)
+        values = {axis.name: axis.at(share(axis))[0] for axis in axes}
+        columns: dict[str, Any] = cells.columns_at([Points(*one) for one in values.items()])
+        made = integrate("projected_area", ndf=ndf, precision=finest(run.device), tolerance=1e-8, device=run.device,
+                         **columns)
         x = values[along.name] if along else np.zeros(1)
         c, x = (a.ravel() for a in np.broadcast_arrays(values["NoV"][None, :], x[:, None]))
         return c, x, np.asarray(made.values, np.float64).ravel(), made.evaluations
@@ -175,7 +165,7 @@ def smith(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresn
     if shape[0] == 2:
         first[1] = np.linalg.lstsq(powers[c == c.min()], 2 * grazing + 0.02, rcond=None)[0]
     found = least_largest(lambda numbers: off(numbers, c, powers, A), first.ravel())
-    values = room_for(shape, precision, out)
+    values = room_for(shape, run.precision, run.out)
     values[...] = found.reshape(shape)
     held = np.asarray(values, np.float64).ravel()
     # Told of points between those that were fitted too, from the coefficients as they are written.
@@ -184,7 +174,7 @@ def smith(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresn
     error = max(float(np.abs(off(held, c, powers, A)).max()), float(np.abs(off(held, c2, powers2, A2)).max()))
     made = Integrated(values, error, used + more, time.perf_counter() - start, f"least-largest-{scheme}",
                       ())
-    if not tell:
+    if not report:
         return made, {}
     pair = _pairs(scheme, *curves(held, powers2), c2, A2, x2)
     name = along.name if along else "x"
@@ -226,7 +216,7 @@ def _pairs(scheme: str | None, k: np.ndarray, q: np.ndarray, c: np.ndarray, A: n
 # ------------------------------------------------------------------------------------------------------ norms
 
 
-def norm_axes(slots: Mapping[str, Chosen]) -> Mapping[str, tuple[float, float, int, str]]:
+def norm_axes(slots: Mapping[str, Chosen]) -> Mapping[str, Ends]:
     """The usual ranges of the parameters that are not given with the NDF."""
     ndf = slots["ndf"]
     return {name: axis for name, axis in NORM_AXES.get(ndf.model.name, {}).items() if name not in ndf.given}
@@ -240,32 +230,30 @@ def norm_check(slots: Mapping[str, Chosen]) -> None:
                                f"{entry.name} has a plain one")
 
 
-def shape_of_norm(scheme: str | None, axes: Sequence[Any]) -> tuple[int, ...]:
+def shape_of_norm(axes: Sequence[Axis]) -> tuple[int, ...]:
     """(1, coefficients) or (coefficients of one, of the other) at the highest degree; the rest are 0."""
     if not 1 <= len(axes) <= 2:
         raise UnsupportedError(f"norm is fitted over one or two parameters, not {len(axes)}: fix the others with --set")
     return tuple(DEGREES.stop for _ in axes)
 
 
-def norm(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, out: np.ndarray | None,
-         precision: int, tolerance: float, device: Device, axes: Sequence[Any], columns_of: Callable[..., Any],
-         backfacing: str | None = None, **columns: Any) -> tuple[Integrated, dict[str, Any]]:
+def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, Any]]:
     """(n,) or (n, n): ln of the norm as a polynomial in the parameters, each from -1 to 1 of its range or of the log of
     it; [i, j] is of x^i y^j, x the first axis. The least degree that meets the tolerance, relative to the norm."""
-    start, entry = time.perf_counter(), ndf.model
+    start, ndf, axes = time.perf_counter(), cells.models["ndf"], cells.axes
+    entry = ndf.model
     which = len(entry.parameters) + next(i for i, n in enumerate(entry.constant_names) if n in ("norm", "per_norm"))
 
-    def exact(share: Callable[[Any], np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
+    def exact(share: Callable[[Axis], np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
         """Parameters and ln norm at shares of the axes, flat."""
-        points = [(axis.name, axis.at(share(axis))[0]) for axis in axes]
-        given = {**ndf.given, **columns_of(points)}
+        given = {**ndf.given, **cells.columns_at([Points(axis.name, axis.at(share(axis))[0]) for axis in axes])}
         every = np.broadcast_arrays(*[np.asarray(given.get(f"ndf_{p.name}", given.get(p.name, p.default)), np.float64)
                                       for p in entry.parameters])
         rows = np.stack([p.check(one, f"ndf {entry.name}").ravel()
                          for p, one in zip(entry.parameters, every, strict=True)])
         names = [p.name for p in entry.parameters]
         mine = [rows[names.index(axis.name.removeprefix("ndf_"))] for axis in axes]
-        return mine, np.log(numbers_of(device, entry, rows)[which])
+        return mine, np.log(numbers_of(run.device, entry, rows)[which])
 
     spans = [Span.of(axis.name, axis.values()) for axis in axes]
 
@@ -278,7 +266,7 @@ def norm(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresne
 
     at, wanted = exact(lambda axis: np.linspace(0, 1, axis.count))
     between, wanted_there = exact(lambda axis: (np.arange(2 * axis.count) + 0.37) / (2 * axis.count))
-    values, error, degree = room_for(shape_of_norm(scheme, axes), precision, out), math.inf, 0
+    values, error, degree = room_for(shape_of_norm(axes), run.precision, run.out), math.inf, 0
     for degree in DEGREES:
         matrix, kept = basis(at, degree)
         weights: np.ndarray = np.ones(wanted.size)
@@ -297,11 +285,11 @@ def norm(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresne
         there, _ = basis(between, degree)
         error = max(float(np.abs(np.expm1(matrix @ held - wanted)).max()),
                     float(np.abs(np.expm1(there @ held - wanted_there)).max()))
-        if error <= tolerance:
+        if error <= run.tolerance:
             break
     made = Integrated(values, error, wanted.size + wanted_there.size, time.perf_counter() - start,
-                      f"least-largest-degree-{degree}", tuple(missed(error, tolerance, precision)))
-    if not tell:
+                      f"least-largest-degree-{degree}", tuple(missed(error, run.tolerance, run.precision)))
+    if not report:
         return made, {}
     kind = values.dtype.name
     names = [span.name.removeprefix("ndf_") for span in spans]
@@ -355,9 +343,9 @@ def _nested(terms: Sequence[str], name: str) -> str:
     return text
 
 
-def header(name: str, told: tuple[Sequence[str], Sequence[str]], version: str) -> str:
+def header(name: str, text: tuple[Sequence[str], Sequence[str]], version: str) -> str:
     """The text of a .h for C and GLSL, its macros named after `name`."""
-    lines, body = told
+    lines, body = text
     guard = f"{name.upper()}_H"
     return "\n".join([*(f"// {line}" for line in lines), f"// Made by whitefurnace {version}.", f"#ifndef {guard}",
                       f"#define {guard}", "", *(line.replace("NAME_", f"{name.upper()}_") for line in body), "",

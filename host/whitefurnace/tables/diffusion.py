@@ -16,16 +16,11 @@ from whitefurnace.catalogue import integral
 from whitefurnace.catalogue.rule import gauss
 from whitefurnace.catalogue.subsurface import Burley, Dipole, Gaussians, Profile, shape, skin
 from whitefurnace.errors import UsageError, nearest
-from whitefurnace.integrals.quadrature import Demand, missed, room_for
+from whitefurnace.integrals.quadrature import TableSpec, missed, room_for
 from whitefurnace.results import Integrated
 from whitefurnace.scenes.scale import MEDIA, Medium
 
-SCHEMES = ("skin", "burley", "dipole", *(name for name in MEDIA if name not in ("water", "air")))
-"""Skin as the Gaussians of d'Eon and Luebke; Christensen and Burley's profile, or the dipole, of what --set says; the
-dipole of a medium that Jensen et al. measured with it."""
-
-AXES = {"NoL": (-1.0, 1.0, 0, "centres"), "curvature": (0.0, 1.0, 0, "centres")}
-"""The usual axes, of the table's size: the cosine of the light over the whole circle, and 1/radius per mm."""
+AXES = ("NoL", "curvature")
 
 CHANNELS = ("r", "g", "b")
 OF_COEFFICIENTS = ("absorption", "scattering")
@@ -101,10 +96,10 @@ def _rgb(name: str, given: Mapping[str, float], default: float | None = None) ->
     return np.array(values, np.float64)
 
 
-def demand(scheme: str | None, columns: Mapping[str, np.ndarray]) -> Demand:
+def diffusion_spec(scheme: str | None, columns: Mapping[str, np.ndarray]) -> TableSpec:
     """What `diffusion` would do, checked without a device. Raises UsageError."""
     _parts(scheme, columns)
-    return Demand(integral("normalization"), {}, np.broadcast_shapes(*(c.shape for c in columns.values())), ())
+    return TableSpec(integral("normalization"), {}, (*np.broadcast_shapes(*(c.shape for c in columns.values())), 3), ())
 
 
 def _parts(scheme: str | None, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, Profile]:
@@ -122,7 +117,7 @@ def _parts(scheme: str | None, columns: Mapping[str, np.ndarray]) -> tuple[np.nd
     return NoL, curvature, found
 
 
-def diffusion(scheme: str | None, tell: bool, *, out: np.ndarray | None, precision: int, tolerance: float,
+def diffusion(scheme: str | None, report: bool, *, out: np.ndarray | None, precision: int, tolerance: float,
               NoL: np.ndarray, curvature: np.ndarray, device: Any = None, backfacing: str | None = None,
               **others: np.ndarray) -> tuple[Integrated, dict[str, Any]]:
     """(…, 3): D(θ, κ) = ∫ q(2 sin(x/2)/κ) max(cos(θ + x), 0) dx / ∫ q dx over x from -π to π, θ = acos NoL.
@@ -143,13 +138,13 @@ def diffusion(scheme: str | None, tell: bool, *, out: np.ndarray | None, precisi
                       f"gauss-panels-{NODES[1]}", tuple(missed(error, tolerance, precision)))
     return made, {
         "channels": ["R", "G", "B"], "units": {"curvature": "1/mm"},
-        "profile": _told(found),
+        "profile": _stated(found),
         "formula": "diffuse = albedo D(n·l, curvature) times the irradiance facing the light; a flat body has "
                    "max(n·l, 0)",
-    } if tell else {}
+    } if report else {}
 
 
-def _told(found: Profile) -> dict[str, Any]:
+def _stated(found: Profile) -> dict[str, Any]:
     if isinstance(found, Gaussians):
         return {"of": "gaussians", "variances_mm2": found.variances.tolist(), "weights": found.weights.tolist()}
     if isinstance(found, Burley):

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,8 @@ import numpy as np
 from whitefurnace.catalogue import integral
 from whitefurnace.catalogue.choice import Chosen
 from whitefurnace.catalogue.rule import gauss
-from whitefurnace.errors import UnsupportedError, UsageError, nearest
-from whitefurnace.integrals.quadrature import ROUNDING, Demand, Grid, grid_of, integrate, missed, room_for
+from whitefurnace.errors import UnsupportedError
+from whitefurnace.integrals.quadrature import ROUNDING, Grid, TableSpec, grid_of, integrate, missed, room_for
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import numbers_of
 from whitefurnace.opencl.device import Device
@@ -35,45 +35,6 @@ AT_ONCE = 1024
 
 CHECK = 96
 """Nodes of the furnace's own average, in another variable than the table's."""
-
-
-@dataclass(frozen=True)
-class Kind:
-    """A table that is no integral of the catalogue but made of some: its schemes (the first is the default), usual
-    model of its slot and the integral that says which axes it has. `make` fills (…, 2), of Fresnel's term alone (…)."""
-
-    name: str
-    model: str
-    schemes: Sequence[str]
-    make: Callable[..., tuple[Integrated, dict[str, Any]]]
-    slot: str = "ndf"
-    fresnel: str | None = None  # the one model of Fresnel's term that it is of, else 1
-    axes: Mapping[str, tuple[float, float, int, str]] = field(default_factory=dict)  # usual ones beside its integral's
-    tolerance: float | None = None  # the usual one of float32, where it is not that of integrals
-    check: Callable[[Mapping[str, Chosen]], None] | None = None
-    digests: Callable[[Mapping[str, Chosen]], tuple[str, ...]] | None = None  # of kernels that are no integral's
-    of: str | None = None  # the integral that says which axes it has, where that is no albedo
-    shape: Callable[[str | None, Sequence[Any]], tuple[int, ...]] | None = None  # of coefficients, where it is a curve
-    axes_of: Callable[[Mapping[str, Chosen]], Mapping[str, tuple[float, float, int, str]]] | None = None
-    channels: int = 2
-    size: int | None = None  # where it is not that of all tables
-    demand: Callable[[str | None, Mapping[str, Any]], Demand] | None = None  # where it is of no BRDF, and in numpy
-    fitted: bool = False  # a fit by itself, over x = roughness and y = √(1 - NoV), whose `make` takes their `middle`s
-
-    def scheme_of(self, given: str | None) -> str | None:
-        """The scheme asked for. Raises UsageError."""
-        if given is None or (self.schemes and given in self.schemes):
-            return given or (self.schemes[0] if self.schemes else None)
-        if not self.schemes:
-            raise UsageError(f"{self.name} has no scheme; energy, glass, ltc and diffusion have")
-        raise UsageError(f"unknown scheme {given!r}{nearest(given, self.schemes)}")
-
-    def integral(self, scheme: str | None) -> str:
-        if self.of:
-            return self.of
-        if self.slot == "fresnel":
-            return "albedo_average"
-        return "dfg" if scheme == "fdez_aguera" else "albedo"
 
 
 def _without_view(columns: Mapping[str, Any]) -> dict[str, Any]:
@@ -108,13 +69,13 @@ def _joined(first: Integrated, *others: Integrated) -> Integrated:
                    notices=tuple(dict.fromkeys(n for one in (first, *others) for n in one.notices)))
 
 
-def _energy(scheme: str, tell: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
+def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
     """(…, 2): kulla_conty (1 - E, 1 - E_avg), complements because float32 does not hold what is lost at α < .01 beside
     1; turquin (E, 1/E - 1); fdez_aguera the split-sum pair. [KullaConty2017; Turquin2019; FdezAguera2019]"""
     E, mean = _albedos(what)
     lost, lost_avg = np.maximum(1 - E.values, 0), np.maximum(1 - mean.values, 0)
     pairs = integrate("dfg", **{**what, "precision": 32, "tolerance": PAIRS, "out": None}) if \
-        tell or scheme == "fdez_aguera" else None
+        report or scheme == "fdez_aguera" else None
     channels = {"kulla_conty": lambda: (lost, lost_avg), "turquin": lambda: (E.values, lost / E.values),
                 "fdez_aguera": lambda: (pairs.values[..., 0], pairs.values[..., 1])}[scheme]()  # type: ignore[union-attr]
     values = _whole(what["out"], channels, what["precision"])
@@ -122,7 +83,7 @@ def _energy(scheme: str, tell: bool, **what: Any) -> tuple[Integrated, dict[str,
     made = replace(_joined(*parts), values=values)
     # The albedos were asked for more exactly than the table was, and need not have come so far.
     made = replace(made, notices=tuple(missed(made.error, what["tolerance"], what["precision"])))
-    if not tell or pairs is None:
+    if not report or pairs is None:
         return made, {}
     # The average again, in μ = x³: the furnace must not be judged by the nodes that made the table.
     x, w = gauss(CHECK)
@@ -167,12 +128,12 @@ def _apart(values: np.ndarray) -> float:
     return float((1 - values.min(-1) / np.where(high > 0, high, 1)).max())
 
 
-def _sheen(scheme: str | None, tell: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
+def sheen(report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
     """(…, 2): E(v) and E_avg of a sheen of colour 1, for the scaling of what lies under it. [Estevez2017]"""
     own = {**what, "out": None}
     E = integrate("albedo", **own)
     mean = integrate("albedo_average", **{k: v for k, v in _without_view(own).items() if k != "backfacing"})
-    if tell and E.values.max() > 1 + E.error:
+    if report and E.values.max() > 1 + E.error:
         raise UnsupportedError(f"a sheen that reflects {E.values.max():.4g} of what arrives leaves less than nothing "
                                "to what lies under it; smith has albedos of at most 1")
     made = replace(_joined(E, mean), values=_whole(what["out"], (E.values, mean.values), what["precision"]))
@@ -184,10 +145,10 @@ def _grid(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> Grid:
     return grid_of(integral("albedo_average"), models, dict(columns), None)
 
 
-def fresnel_demand(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> Demand:
+def fresnel_spec(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> TableSpec:
     """What `fresnel_average` would do, checked without a device."""
     slots = {"fresnel": models["fresnel"].model}
-    return Demand(integral("albedo_average"), models, _grid(models, columns).shape,
+    return TableSpec(integral("albedo_average"), models, _grid(models, columns).shape,
                   (source.evaluation("FRESNEL_F", slots).digest,))
 
 
@@ -221,9 +182,8 @@ def _halved(F: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int,
     return total, float(left.max()), used
 
 
-def _fresnel_average(scheme: str | None, tell: bool, *, fresnel: Chosen, out: np.ndarray | None, precision: int,
-                     tolerance: float, device: Device, backfacing: str | None = None,
-                     **columns: Any) -> tuple[Integrated, dict[str, Any]]:
+def fresnel_average(*, fresnel: Chosen, out: np.ndarray | None, precision: int, tolerance: float, device: Device,
+                    backfacing: str | None = None, **columns: Any) -> Integrated:
     """(…): F_avg = 2∫ F(μ) μ dμ to 1e-6 or better."""
     start, entry = time.perf_counter(), fresnel.model
     slots, grid = {"fresnel": entry}, _grid({"fresnel": fresnel}, columns)
@@ -244,11 +204,5 @@ def _fresnel_average(scheme: str | None, tell: bool, *, fresnel: Chosen, out: np
         error, evaluations = max(error, left), evaluations + used
     error += 1e-7 * float(np.abs(flat).max()) if 32 in (precision, finest) else 1e-15  # of the format
     return Integrated(values, error, evaluations, time.perf_counter() - start, "gauss-halved-10",
-                      tuple(missed(error, tolerance, precision))), {}
+                      tuple(missed(error, tolerance, precision)))
 
-
-KINDS = {kind.name: kind for kind in (
-    Kind("energy", "ggx", ("kulla_conty", "turquin", "fdez_aguera"), _energy),
-    Kind("sheen", "charlie", (), _sheen),
-    Kind("fresnel_average", "schlick", (), _fresnel_average, "fresnel"),
-)}

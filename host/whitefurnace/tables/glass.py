@@ -20,13 +20,6 @@ from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import CELLS_A_LAUNCH
 from whitefurnace.results import Integrated
 
-SCHEMES = ("entering", "leaving")
-"""Light that comes from the side where the index is 1, or from the other: there Fresnel's n is 1/ior."""
-
-IORS = (1.0, 3.0, 16, "f0")
-"""The usual third axis: equal steps of F0^¼, which is √((n - 1)/(n + 1)), as Cycles has them, to OSPRay's largest."""
-
-
 TOLERANCE = 1e-5
 """The usual tolerance of float32 tables, and the least that float32 is asked for: finer ones are made in float64."""
 
@@ -71,7 +64,7 @@ def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
     return (source.refraction({slot: choice.model for slot, choice in slots.items()}).digest,)
 
 
-def glass(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, out: np.ndarray | None,
+def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, out: np.ndarray | None,
           precision: int, tolerance: float, device: Device, backfacing: str | None = None,
           **columns: Any) -> tuple[Integrated, dict[str, Any]]:
     """(…, 2): the shares R and T of the energy that arrives along v, single scattering. [Walter2007]"""
@@ -107,7 +100,7 @@ def glass(scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresn
     notices = (*tally.notices(), *missed(error, tolerance, precision))
     made = Integrated(values, error, tally.evaluations + (whole.evaluations if whole else 0),
                       time.perf_counter() - start, tally.rule.name if tally.rule else "", notices)
-    if not tell:
+    if not report:
         return made, {}
     both = flat.sum(1, dtype=np.float64)
     return made, {"channels": ["reflected", "transmitted"], "largest": float(both.max()), "least": float(both.min()),

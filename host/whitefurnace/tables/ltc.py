@@ -17,7 +17,7 @@ the difference, as the public one, sees little of m: its table has .124, and its
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,13 +33,6 @@ from whitefurnace.opencl.derived import finest
 from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import evaluate, over_cells
 from whitefurnace.results import Integrated
-
-SCHEMES = ("free", "heitz")
-_ALL = ("xx", "zx", "xz", "zz", "norm", "fresnel", "0", "sphere")
-CHANNELS: Mapping[str, tuple[str, ...]] = {"ltc": _ALL, "ltc_1": _ALL[:4], "ltc_2": _ALL[4:]}
-"""Of each kind of table, in the order of the two textures that engines load."""
-
-SIZE = 64
 
 STAGES = ((Rule("gauss", 16, 32, 12), 0.3, 12), (Rule("gauss", 40, 64, 26), 0.02, 20))
 """Rules of half vectors, how far the corner of |f̂ - p| is rounded off, and steps at most. The first finds the basin
@@ -307,7 +300,7 @@ def sphere_form_factor(z: np.ndarray, length: np.ndarray) -> np.ndarray:
     return np.where(cut, area / (np.pi * np.where(cut, length, 1)), np.maximum(z, 0))
 
 
-def _told(m: np.ndarray) -> dict[str, float]:
+def _stated(m: np.ndarray) -> dict[str, float]:
     return {"mean": float(m.mean()), "median": float(np.median(m)), "p99": float(np.quantile(m, 0.99)),
             "max": float(m.max())}
 
@@ -332,10 +325,11 @@ def matrices(scheme: str, device: Device, models: Mapping[str, Chosen], albedo: 
     return fit.N.reshape(4, *np.shape(albedo)), lobes
 
 
-def ltc(kind: str, scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, device: Device,
-        precision: int, tolerance: float, out: np.ndarray | None, backfacing: str | None = None,
-        middle: Mapping[str, Any] | None = None, **columns: Any) -> tuple[Integrated, dict[str, Any]]:
-    """(…, c) of the channels of `kind`: ltc_1 the matrix, ltc_2 (norm, Fresnel, 0, sphere), ltc both.
+def ltc(kind: str, names: Sequence[str], scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen,
+        fresnel: Chosen, device: Device, precision: int, tolerance: float, out: np.ndarray | None,
+        backfacing: str | None = None, middle: Mapping[str, Any] | None = None,
+        **columns: Any) -> tuple[Integrated, dict[str, Any]]:
+    """(…, c) of the channels `names`: of ltc_1 the matrix, of ltc_2 (norm, Fresnel, 0, sphere), of ltc both.
 
     norm and Fresnel are ∫ f (n·l) dω with F = 1 and with F = (1 - v·h)⁵, so that a light of radiance 1 over the polygon
     P is seen as (F0 norm + (1 - F0) Fresnel) ∫_P p dω. The sphere's table is over axes of its own: x is the cosine from
@@ -346,7 +340,6 @@ def ltc(kind: str, scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chos
     pairs = integrate("dfg", ndf=ndf, masking=masking, device=device, precision=finest(device), backfacing=backfacing,
                       tolerance=max(tolerance / 2, 1e-9), **columns)
     norm = pairs.values.sum(-1, dtype=np.float64)
-    names = CHANNELS[kind]
     channels = {"norm": norm, "fresnel": pairs.values[..., 1], "0": np.zeros(norm.shape)}
     facts: dict[str, Any] = {"channels": list(names)}
     if "sphere" in names:
@@ -356,9 +349,9 @@ def ltc(kind: str, scheme: str | None, tell: bool, *, ndf: Chosen, masking: Chos
     if "xx" in names:
         if backfacing is not None:
             raise UnsupportedError(f"{kind} has no views from behind: leave backfacing out")
-        N, lobes = matrices(scheme or SCHEMES[0], device, models, norm, columns)
+        N, lobes = matrices(scheme or "free", device, models, norm, columns)
         channels |= {"xx": N[0], "xz": N[1], "zx": N[2], "zz": N[3]}
-        if tell:
+        if report:
             facts |= _facts(N, lobes, models, middle, precision, device)
     values = room_for((*norm.shape, len(names)), precision, out)
     for k, name in enumerate(names):
@@ -372,15 +365,15 @@ def _facts(N: np.ndarray, lobes: Lobes, models: Mapping[str, Chosen], middle: Ma
     """What is misplaced by the matrices as formats hold them, and by what is read in the middle of four texels."""
     flat, name = N.reshape(4, -1), f"float{precision}"
     kinds = {name: f"f{precision // 8}", "float16": "f2"}
-    told: dict[str, Any] = {held: _told(lobes.misplaced(_stored(flat, kind))) for held, kind in kinds.items()}
+    stated: dict[str, Any] = {held: _stated(lobes.misplaced(_stored(flat, kind))) for held, kind in kinds.items()}
     if middle is not None:
         albedo = integrate("albedo", ndf=models["ndf"], masking=models["masking"], device=device,
                            precision=lobes.precision, tolerance=1e-6, **middle)
         between, _ = lobes_of(device, models, albedo.values, middle)
-        told["between"] = {held: _told(between.misplaced(_four(_stored(N, kind)).reshape(4, -1)))
+        stated["between"] = {held: _stated(between.misplaced(_four(_stored(N, kind)).reshape(4, -1)))
                            for held, kind in kinds.items()}
     below = horizon(flat)[0]
-    return {"misplaced": told, "below_horizon": {"mean": float(below.mean()), "max": float(below.max())},
+    return {"misplaced": stated, "below_horizon": {"mean": float(below.mean()), "max": float(below.max())},
             "formula": "p(ω) = det N max(w.z, 0)/(π |w|⁴), w = (xx ω.x + xz ω.z, ω.y, zx ω.x + zz ω.z), v = (sin θ, 0, "
                        "cos θ); reflected: (F0 norm + (1 - F0) fresnel) ∫ p L dω",
             "misplaced_is": "∫ |f (n·l)/norm - p| dω over the sphere, by nodes that the fit has not"}

@@ -1,34 +1,74 @@
-"""Split-sum tables as engines lay them out: axes, form and channels of a preset."""
+"""The split-sum pair in the forms and with the channels that engines read."""
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from whitefurnace.catalogue.choice import Spec, chosen
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen
 from whitefurnace.engines.presets import Dfg
 from whitefurnace.integrals.quadrature import integrate, rows_of_roughness
 from whitefurnace.opencl.device import Device
+from whitefurnace.results import Integrated
+from whitefurnace.tables.cells import Cells
 
 TOLERANCE = 5e-6
-"""Of the pairs; half floats have steps of 2.4e-4."""
+"""Tolerance of the pairs of a bake; half floats have steps of 2.4e-4."""
 
 CHARLIE = 1e-4
-"""Of Charlie's albedo: its error as half is 2e-4."""
+"""Least tolerance of Charlie's albedo: its error as half is 2e-4."""
+
+CHANNELS: Mapping[str, tuple[tuple[str, str], str]] = {
+    "scale_bias": (("scale", "bias"), "E(v; F0) = F0 scale + bias"),
+    "multiscatter": (("∫Fc", "∫1"), "E(v; F0) = mix(∫Fc, ∫1, F0)"),
+}
+"""Channels of each form, and how a shader reads them. Schlick's F90 is 1, so ∫Fc = bias and ∫1 = scale + bias."""
 
 
 @dataclass(frozen=True)
 class SplitSum:
-    """`values` (size, size, 2 or 3) float32, row y, column x, as the engine reads them; `error` bounds the first two
-    channels, absolutely, `charlie_error` the third (0 without one)."""
+    """The table of a preset.
+
+    values: (size, size, 2 or 3) float32, row y, column x, as the engine reads them. error: bound of the absolute error
+    of the first two channels. charlie_error: that of the third channel, 0 without one.
+    """
 
     values: np.ndarray
     error: float
     charlie_error: float
     rule: str
     notices: tuple[str, ...]
+
+
+def laid_out(form: str, pair: Mapping[str, Any], cloth: Mapping[str, Any] | None = None,
+             progress: Callable[[float], None] | None = None) -> tuple[Integrated, float]:
+    """The pair in a form, […, 2], or with Charlie's albedo as a third channel, and the error of that channel.
+
+    form: a key of `CHANNELS`. pair: arguments of `integrate` for the pair. cloth: those for Charlie's albedo, or None
+    where it is no channel; its tolerance is at least `CHARLIE`. Raises as `integrate` does.
+    """
+    out = pair.get("out")
+    made = integrate("dfg", progress=progress, **{**pair, "out": out if cloth is None else None})
+    if form == "multiscatter":
+        made.values[..., 0] += made.values[..., 1]
+        made.values[...] = made.values[..., ::-1].copy()
+        made = replace(made, error=2 * made.error)
+    if cloth is None:
+        return made, 0.0
+    own = integrate("albedo", **{**cloth, "out": None, "tolerance": max(cloth["tolerance"], CHARLIE)})
+    values = np.concatenate([made.values, np.broadcast_to(own.values, made.values.shape[:-1])[..., None]], -1)
+    if out is not None:
+        out[...] = values
+    return replace(made, values=values if out is None else out, evaluations=made.evaluations + own.evaluations,
+                   notices=(*made.notices, *own.notices)), float(own.error)
+
+
+def charlie(cells: Cells) -> dict[str, Any]:
+    """Charlie's lobe with the masking of a table, and its parameters over the same cells."""
+    models: dict[str, Chosen] = {"ndf": chosen("ndf", "charlie"), "masking": cells.models["masking"]}
+    return {**models, **cells.columns_for(models)}
 
 
 def axis_values(name: str, spacing: str, size: int) -> np.ndarray:
@@ -38,30 +78,17 @@ def axis_values(name: str, spacing: str, size: int) -> np.ndarray:
     return (np.arange(size) + 0.5) / size
 
 
-def split_sum(table: Dfg, *, device: Device, ndf: Spec = "ggx", masking: Spec = "smith",
-              integrated: Callable[..., Any] = integrate) -> SplitSum:
-    """The table of a preset. Raises as `integrate` does."""
+def split_sum(table: Dfg, *, device: Device, ndf: Spec = "ggx", masking: Spec = "smith") -> SplitSum:
+    """The table of a preset, in float32. Raises as `integrate` does."""
     x, y = (axis_values(name, table.NoV, table.size) for name in (table.x, table.y))
     across = {table.x: np.broadcast_to(x[None], (table.size, table.size)),
               table.y: np.broadcast_to(y[:, None], (table.size, table.size))}
-    NoV = across["NoV"]
     roughness = across["roughness"] if "roughness" in across else np.sqrt(across["alpha"])
 
-    def made(name: str, entry: Spec, tolerance: float) -> Any:
-        choice = chosen("ndf", entry)
-        return integrated(name, ndf=choice, masking=masking, tolerance=tolerance, device=device, NoV=NoV,
-                          **rows_of_roughness(choice, roughness))
+    def of(spec: Spec) -> dict[str, Any]:
+        choice = chosen("ndf", spec)
+        return {"ndf": choice, "masking": masking, "tolerance": TOLERANCE, "device": device, "NoV": across["NoV"],
+                **rows_of_roughness(choice, roughness)}
 
-    pairs = made("dfg", ndf, TOLERANCE)
-    scale, bias = np.asarray(pairs.values, np.float64)[..., 0], np.asarray(pairs.values, np.float64)[..., 1]
-    # E = F0 scale + bias = mix(∫Fc, ∫1, F0), since F90 = 1: ∫Fc = bias and ∫1 = scale + bias.
-    channels = [scale, bias] if table.form == "scale_bias" else [bias, scale + bias]
-    error, charlie_error, notices = float(pairs.error), 0.0, tuple(pairs.notices)
-    if table.form == "multiscatter":
-        error *= 2
-    if table.charlie:
-        cloth = made("albedo", "charlie", CHARLIE)
-        channels.append(np.asarray(cloth.values, np.float64))
-        charlie_error = float(cloth.error)
-        notices += tuple(cloth.notices)
-    return SplitSum(np.stack(channels, -1).astype(np.float32), error, charlie_error, pairs.rule, notices)
+    made, charlie_error = laid_out(table.form, of(ndf), of("charlie") if table.charlie else None)
+    return SplitSum(made.values, made.error, charlie_error, made.rule, made.notices)

@@ -1,0 +1,96 @@
+"""The cells of a table (models, parameters, light) and how they are to be computed: what a kind of table works on."""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.catalogue.choice import Chosen
+from whitefurnace.opencl.device import Device
+from whitefurnace.tables.axes import Axis, Points, columns_of
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """The light that a table is lit by.
+
+    arguments: as `whitefurnace.integrate` takes them. recipe: what a manifest states of an environment.
+    """
+
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+    recipe: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """A grid of parameters of some models.
+
+    axes: those of the table, x first. fixed: parameters that are one number. points: values at which the table is
+    computed instead of at those of its axes.
+    """
+
+    models: Mapping[str, Chosen]
+    axes: tuple[Axis, ...]
+    fixed: Mapping[str, float]
+    scheme: str | None = None
+    backfacing: str | None = None
+    lighting: Lighting = Lighting()
+    points: tuple[Points, ...] | None = None
+
+    @cached_property
+    def columns(self) -> dict[str, np.ndarray]:
+        """The parameters as `integrate` takes them: numbers, and arrays that broadcast to […, y, x]."""
+        return self.columns_at(self.axes if self.points is None else self.points)
+
+    def columns_at(self, points: Sequence[Axis | Points],
+                   models: Mapping[str, Chosen] | None = None) -> dict[str, np.ndarray]:
+        """The parameters at other values of the axes, or for other models."""
+        return columns_of(points, self.models if models is None else models, self.fixed)
+
+    def columns_for(self, models: Mapping[str, Chosen]) -> dict[str, np.ndarray]:
+        """The parameters of the same cells for other models."""
+        return self.columns_at(self.axes if self.points is None else self.points, models)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the grid, […, y, x], without channels."""
+        return np.broadcast_shapes(*map(np.shape, self.columns.values()))
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Models, parameters and `backfacing`, as `integrate` takes them."""
+        return {**self.models, **self.columns, "backfacing": self.backfacing}
+
+    def middle(self) -> dict[str, np.ndarray] | None:
+        """The parameters in the middle of every four texels; None where the axes are not two with two texels each."""
+        if len(self.axes) != 2 or min(a.count for a in self.axes) < 2:
+            return None
+        points = []
+        for one in self.axes:
+            k = np.arange(one.count - 1)
+            points.append(Points(one.name, one.at((k + 1) / one.count if one.scale == "centres" else
+                                                  (k + 0.5) / (one.count - 1))[0]))
+        return self.columns_at(points)
+
+
+@dataclass(frozen=True)
+class Run:
+    """How cells are computed.
+
+    device: None for a kind that needs none. precision: 32 or 64. tolerance: absolute. out: the array to fill, or None
+    for a new one. progress: called with the share done.
+    """
+
+    device: Device
+    precision: int
+    tolerance: float
+    out: np.ndarray | None = None
+    progress: Callable[[float], None] | None = None
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """Device, precision, tolerance and `out`, as `integrate` takes them."""
+        return {"device": self.device, "precision": self.precision, "tolerance": self.tolerance, "out": self.out}

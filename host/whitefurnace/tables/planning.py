@@ -1,0 +1,186 @@
+"""A request for a table, checked and completed: what will be computed and written, found without a device."""
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from whitefurnace.catalogue import integral
+from whitefurnace.catalogue.choice import chosen, is_number
+from whitefurnace.errors import UsageError, nearest
+from whitefurnace.files import check_table, stored_format
+from whitefurnace.integrals.api import integrate
+from whitefurnace.integrals.quadrature import DEFAULT_TOLERANCE, TableSpec
+from whitefurnace.tables.axes import Axis, number, placed, size_of
+from whitefurnace.tables.cells import Cells
+from whitefurnace.tables.kind import Kind
+from whitefurnace.tables.kinds import kind as kind_of
+from whitefurnace.tables.kinds import scheme_of
+from whitefurnace.tables.request import TableRequest
+from whitefurnace.version import VERSION
+
+FORMS = (".npy", ".exr", ".png", ".ktx2", ".dds", ".h")
+"""Suffixes of the files that a table is written to."""
+
+FITS = ("bilinear",)
+
+FITTED = (2, 512)
+"""The least and the largest number of texels along an axis for which reads between them are measured."""
+
+CHANNELS = {1: ("Y",), 2: ("R", "G"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
+"""Names of the channels in EXR, by their number."""
+
+OPTIONS = frozenset(inspect.signature(integrate).parameters) - {"parameters"}
+"""Names that are options of `integrate` and cannot be parameters."""
+
+
+@dataclass(frozen=True)
+class TablePlan:
+    """A table that can be made: a request that was checked.
+
+    fit: "bilinear" where texels are fitted for reads between them. as_read: whether the error of such reads is
+    measured. stored: the pixel format of a texture.
+    """
+
+    kind: Kind
+    path: Path
+    cells: Cells
+    spec: TableSpec
+    precision: int
+    tolerance: float
+    fit: str | None
+    as_read: bool
+    stored: str | None
+    force: bool
+
+    @property
+    def axes(self) -> tuple[Axis, ...]:
+        """The axes, the fastest, x, first."""
+        return self.cells.axes
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the array, […, y, x(, channel)]."""
+        return self.spec.shape
+
+    @property
+    def form(self) -> str:
+        """The suffix of the file, in lower case."""
+        return self.path.suffix.lower()
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        return np.dtype(f"f{self.precision // 8}")
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the array before compression."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+    @property
+    def manifest_path(self) -> Path:
+        return self.path.with_name(self.path.name + ".json")
+
+    def canonical(self) -> dict[str, Any]:
+        """The recipe as data: everything that changes the bytes, and nothing else."""
+        cells = self.cells
+        return {"integral": self.kind.name, "models": {slot: c.canonical() for slot, c in self.spec.slots.items()},
+                "parameters": dict(cells.fixed), "axes": [a.canonical() for a in self.axes],
+                "backfacing": cells.backfacing, "precision": self.precision, "tolerance": self.tolerance,
+                **({"fit": self.fit} if self.fit else {}), **({"as_read_stated": True} if self.as_read else {}),
+                **({"scheme": cells.scheme} if cells.scheme else {}), **cells.lighting.recipe,
+                **({"stored_format": self.stored} if self.stored else {}), **self.kind.recipe(),
+                "format": self.form}
+
+    def key(self) -> str:
+        """sha256 over the recipe, the kernels and the version."""
+        parts = [VERSION, json.dumps(self.canonical(), sort_keys=True), *self.spec.digests]
+        return hashlib.sha256("\n".join(parts).encode()).hexdigest()
+
+
+def plan(request: TableRequest) -> TablePlan:
+    """Check a request and complete it. Raises UsageError, UnsupportedError, and what reading a user's file raises."""
+    kind, request = kind_of(request.kind).settled(request)
+    scheme = scheme_of(kind, request.scheme)
+    path = Path(request.path)
+    _check_file(kind, path, request.precision)
+    tolerance = _tolerance(kind, request)
+    # Chosen once: a user's file is read once, and what was read is what the key is of.
+    models = {slot: chosen(slot, spec) for slot, spec in kind.specs(request).items()}
+    fixed = {name: number(name, value) for name, value in (request.parameters or {}).items()}
+    size = size_of(kind.size if request.size is None else request.size)
+    given = kind.with_usual_axes(request.axes or {}, models, fixed, size)
+    for name in (*fixed, *given):
+        if name in OPTIONS:
+            raise UsageError(f"{name} is an option and no parameter; a model's own of that name is SLOT_{name}")
+    view = integral(kind.integral(scheme)).view
+    axes = kind.arranged(placed(kind.default_axes(size), size, view, models, given, fixed))
+    as_read = _check_axes(kind, path, axes, request)
+    cells = Cells(models, axes, fixed, scheme, request.backfacing, kind.lighting(request))
+    spec = kind.spec(cells)
+    stored = _check_shape(kind, path, axes, spec.shape, request.stored)
+    return TablePlan(kind, path, cells, spec, request.precision, tolerance, request.fit, as_read, stored, request.force)
+
+
+def _check_file(kind: Kind, path: Path, precision: int) -> None:
+    """Raises UsageError for a file that cannot hold such a table."""
+    form = path.suffix.lower()
+    if form not in FORMS:
+        raise UsageError(f"{path}: a table is written as {', '.join(FORMS[:-1])} or {FORMS[-1]}, not "
+                         f"{path.suffix or 'without a suffix'}")
+    if precision not in DEFAULT_TOLERANCE:
+        raise UsageError(f"precision {precision} is not one of {', '.join(map(str, DEFAULT_TOLERANCE))}")
+    if form not in (".npy", ".h") and precision == 64:
+        raise UsageError(f"{form[1:].upper()} holds float32 at most: give .npy or .h for precision 64")
+    if kind.coefficients and form not in (".npy", ".h"):
+        raise UsageError(f"{kind.name} is written as coefficients, to .h or .npy, not {form}")
+
+
+def _tolerance(kind: Kind, request: TableRequest) -> float:
+    """The tolerance asked for, or the usual one. Raises UsageError."""
+    tolerance = request.tolerance
+    if tolerance is None:
+        tolerance = kind.usual_tolerance(request)
+    if tolerance is None:
+        tolerance = DEFAULT_TOLERANCE[request.precision]
+    if not is_number(tolerance) or not 0 < tolerance < 1:  # also NaN
+        raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
+    return float(tolerance)
+
+
+def _check_axes(kind: Kind, path: Path, axes: tuple[Axis, ...], request: TableRequest) -> bool:
+    """Whether reads between texels are to be measured. Raises UsageError for axes that do not serve."""
+    if path.suffix.lower() == ".exr" and len(axes) > 2:
+        raise UsageError(f"EXR holds two axes, not {len(axes)}: give .npy")
+    if not axes:
+        raise UsageError("a table has an axis at least, and every parameter is given as a number")
+    if request.fit is not None and request.fit not in FITS:
+        raise UsageError(f"unknown fit {request.fit!r}{nearest(str(request.fit), FITS)}")
+    as_read = request.as_read or request.fit is not None
+    if as_read and not kind.refittable:
+        raise UsageError(f"{kind.name} is a fit by itself, and states what is misplaced between texels: leave out "
+                         "--fit and --as-read")
+    if as_read and not (len(axes) == 2 and all(FITTED[0] <= a.count <= FITTED[1] for a in axes)):
+        raise UsageError(f"what is read between texels is told of tables with two axes of {FITTED[0]} to {FITTED[1]}")
+    return as_read
+
+
+def _check_shape(kind: Kind, path: Path, axes: tuple[Axis, ...], shape: tuple[int, ...],
+                 stored: str | None) -> str | None:
+    """The pixel format of a texture, None for other files. Raises UsageError for an array that the file cannot hold."""
+    form = path.suffix.lower()
+    if form == ".exr" and shape[2:] and shape[2] not in CHANNELS:
+        raise UsageError(f"EXR holds 1 to 4 channels, not {shape[2]}: give .npy{kind.if_too_many_channels}")
+    rows, channels = shape[:max(len(axes), 2)], math.prod(shape[max(len(axes), 2):])
+    if form not in (".npy", ".exr") and not kind.coefficients:
+        check_table(form, rows, channels)
+    return stored_format(form, channels, stored)
+
+
+__all__ = ["CHANNELS", "FORMS", "TablePlan", "TableRequest", "plan"]

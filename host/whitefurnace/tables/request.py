@@ -1,0 +1,48 @@
+"""What a caller asks of a table, before anything of it is checked."""
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from whitefurnace.catalogue.choice import Spec
+    from whitefurnace.sphere.environments import Environment
+    from whitefurnace.tables.axes import AxisSpec
+
+
+@dataclass(frozen=True)
+class TableRequest:
+    """Every option of a table, with its default; `whitefurnace.lut` says what each means.
+
+    `size`, `tolerance` and `scheme` are the kind's own where they are None.
+    """
+
+    kind: str
+    path: str | os.PathLike[str]
+    size: int | str | Sequence[int] | None = None
+    axes: Mapping[str, AxisSpec] | None = None
+    ndf: Spec | None = None
+    masking: Spec | None = None
+    fresnel: Spec | None = None
+    diffuse: Spec | None = None
+    brdf: Spec | None = None
+    light: Spec | None = None
+    environment: str | os.PathLike[str] | np.ndarray | Environment | None = None
+    normal: Sequence[float] | None = None
+    rotate: float = 0.0
+    exposure: float = 0.0
+    nonfinite: str = "refuse"
+    backfacing: str | None = None
+    precision: int = 32
+    tolerance: float | None = None
+    fit: str | None = None
+    as_read: bool = False
+    scheme: str | None = None
+    stored: str | None = None
+    for_: str | None = None
+    force: bool = False
+    parameters: Mapping[str, float | str] | None = None
