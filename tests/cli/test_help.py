@@ -25,6 +25,7 @@ from whitefurnace.rendering.side_by_side import TOLERANCE_RANGE as TRUTH_TOLERAN
 from whitefurnace.scenes.material_spheres import COUNT_RANGE
 from whitefurnace.scenes.media import ROWS
 from whitefurnace.sphere.harmonics import CUTOFFS
+from whitefurnace.tables.kinds import kinds
 
 COMMANDS = ["bake", "batch", "bench", "compare", "devices", "engines", "inspect", "lut", "models", "render", "scene",
             "verify"]
@@ -140,3 +141,10 @@ def test_no_function_is_long():
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.FunctionDef):
                 assert node.end_lineno - node.lineno < 80, f"{path.name}: {node.name}"
+
+
+def test_help_of_lut_lists_every_kind_and_scheme():
+    text, schemes = shown("lut"), option("lut", "--scheme")
+    for name, kind in kinds().items():
+        assert re.search(rf"^ +{name} +{re.escape(kind.summary)}$", text, re.M), name
+        assert all(scheme in schemes for scheme in kind.schemes)

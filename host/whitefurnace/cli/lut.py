@@ -14,7 +14,14 @@ from whitefurnace.text import size, table
 if TYPE_CHECKING:
     from whitefurnace.tables.lut import Table
 
-EPILOG = f"""\b
+HELP = f"""Write a table of an integral over a grid of parameters.
+
+\b
+KIND is what to tabulate:
+{listed()}
+"""
+
+EPILOG = """\b
 Examples:
   whitefurnace lut dfg -o dfg.npy --size 256
   whitefurnace lut dfg -o fitted.npy --size 64 --axis sqrt --fit bilinear
@@ -37,10 +44,6 @@ direction has one axis, r, as x.
 ndf_alpha for the alpha of the slot ndf. --axis NAME=A:B:N replaces the usual axis of that name, or adds a slower one.
 The first and last values are A and B, except on the scale `centres`. FILE.json beside FILE describes the table.
 
-\b
-Kinds:
-{listed()}
-
 Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported,
 7 a check failed, 130 interrupted.
 """
@@ -48,7 +51,7 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device o
 OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of the kind radiance", "Accuracy"
 
 
-@options.command("Bake and tabulate", "Tabulate an integral of a BRDF over roughness and view angle", EPILOG)
+@options.command("Bake and tabulate", "Tabulate an integral of a BRDF over roughness and view angle", EPILOG, HELP)
 @click.argument("kind")
 @options.output_file("Table to write: .npy, .exr, .png (values from 0 to 1), .ktx2, .dds or .h.")
 @options.option("--format", "stored", metavar="NAME", heading=OUTPUT,
@@ -105,10 +108,7 @@ def lut(kind: str, output: Path, stored: str | None, for_: str | None, scheme: s
         normal: tuple[float, float, float] | None, rotate: float, exposure: float, nonfinite: str,
         tolerance: float | None, precision: int, fit: str | None, as_read: bool, device: str | None, dry_run: bool,
         force: bool, as_json: bool, quiet: bool) -> None:
-    """Write a table of an integral over a grid of parameters.
-
-    KIND is what to tabulate, one of the kinds that are listed at the end.
-    """
+    """Write a table of an integral over a grid of parameters."""
     from whitefurnace.tables import lut as tables
     from whitefurnace.tables.axes import named, named_axes
 

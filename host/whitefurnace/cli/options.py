@@ -68,13 +68,14 @@ class Group(click.Group):
                     formatter.write_dl(rows)
 
 
-def command(task: Task, summary: str, epilog: str) -> Callable[[Callable[..., Any]], Command]:
+def command(task: Task, summary: str, epilog: str, help: str | None = None) -> Callable[[Callable[..., Any]], Command]:
     """Make a function the command of its own name.
 
     task: the heading in `whitefurnace --help`. summary: one line beside the name there, at most 62 characters.
-    epilog: examples and exit codes, after the options.
+    epilog: examples and exit codes, after the options. help: what the command does, by default the function's
+    docstring.
     """
-    return click.command(cls=Command, task=task, short_help=summary, epilog=epilog)
+    return click.command(cls=Command, task=task, short_help=summary, epilog=epilog, help=help)
 
 
 def option(*names: str, heading: str, help: str, **attributes: Any) -> Decorator:
