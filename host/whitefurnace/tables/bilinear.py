@@ -1,4 +1,4 @@
-"""Tables as a GPU reads them: bilinearly, clamped at the edges. Texels that read best, and what a read is off by."""
+"""Bilinear reads of tables as a GPU does them, clamped at the edges: texels fitted for such reads, and their errors."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -7,22 +7,25 @@ from typing import Any
 import numpy as np
 
 SAMPLES = 6
-"""Points a texel and axis that a fit sees."""
+"""Sample points for each texel and axis of a fit."""
 
 ROUNDS = 4
-"""Rounds of weights that follow the errors [Lawson1961], axis by axis: the first round is least squares; four bring a
-64² split-sum table from 4.4e-3 to 3.7e-3 at its worst, more trade the 99th percentile for nothing."""
+"""Rounds of a fit. The first is least squares, the others weight the rows and columns by their errors [Lawson1961].
+Four rounds bring the largest error of a 64² split-sum table from 4.4e-3 to 3.7e-3; more raise the 99th percentile."""
 
 LEAST = 0.045
-"""Roughness that engines shade with at least [Lagarde2014]: r = n·v = 0 is a point where the pair has no limit, and no
-table of texels holds it. Below, a fit weighs little and errors are stated apart."""
+"""Least roughness that engines shade with [Lagarde2014]. At r = n·v = 0 the split-sum pair has no limit, so no table of
+texels can hold it. Rows below this roughness weigh little in a fit, and their errors are stated separately."""
 
 FAINT = 1e-2
-"""The weight of rows below that."""
+"""Weight of the rows below `LEAST`."""
 
 
 def hats(count: int, x: np.ndarray) -> np.ndarray:
-    """(n, count): weights of texels in a linear read at texel coordinates x (n,), 0 the first texel's centre."""
+    """Weights (n, count) of the texels of an axis in linear reads at the texel coordinates x, (n,).
+
+    Coordinate 0 is the centre of the first texel. Coordinates beyond the ends are clamped.
+    """
     x = np.clip(x, 0, count - 1)
     first = np.minimum(x.astype(np.intp), max(count - 2, 0))
     weights = np.zeros((x.size, count))
@@ -33,13 +36,16 @@ def hats(count: int, x: np.ndarray) -> np.ndarray:
 
 
 def read(texels: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """(ny, nx, c): reads of texels (M, N, c) by the weights of both axes."""
+    """Reads (ny, nx, c) of texels (M, N, c), with the weights `down` (ny, M) and `across` (nx, N) of `hats`."""
     return np.stack([down @ texels[..., c] @ across.T for c in range(texels.shape[2])], -1)
 
 
 def fit(truth: np.ndarray, down: np.ndarray, across: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """(M, N, c) float64: texels whose reads are nearest to `truth` (ny, nx, c) at its worst, by least squares with
-    weights that follow the errors; `counted` (ny,) are the rows that matter."""
+    """Texels (M, N, c), float64, for which the largest error of reads against `truth` (ny, nx, c) is small.
+
+    down, across: weights of the reads, from `hats`. counted: (ny,) booleans, the rows whose errors matter. Weighted
+    least squares, whose weights follow the errors of the round before.
+    """
     wy, wx = np.where(counted, 1.0, FAINT), np.ones(truth.shape[1])
     best, least = np.empty(0), np.inf
     for _ in range(ROUNDS):
@@ -57,8 +63,11 @@ def fit(truth: np.ndarray, down: np.ndarray, across: np.ndarray, counted: np.nda
 
 
 def formats(texels: np.ndarray, dtype: np.dtype[Any]) -> Mapping[str, np.ndarray]:
-    """The texels as formats hold them, rounded to the nearest: as they are, float16, and r8, 8 bits from 0 to 1 with
-    what a fit leaves beyond clamped, where they lie about there."""
+    """The texels as each format holds them, by its name, rounded to nearest.
+
+    The formats are `dtype`, float16 where the values fit, and r8 (8 bits from 0 to 1, clamped) where the values lie
+    between -0.1 and 1.1: a fit may leave them slightly outside [0, 1].
+    """
     held = {dtype.name: texels.astype(dtype).astype(np.float64)}
     if np.abs(texels).max() <= np.finfo(np.float16).max:
         held["float16"] = texels.astype(np.float16).astype(np.float64)
@@ -68,6 +77,6 @@ def formats(texels: np.ndarray, dtype: np.dtype[Any]) -> Mapping[str, np.ndarray
 
 
 def errors(off: np.ndarray, counted: np.ndarray) -> dict[str, float]:
-    """p99 and max of absolute errors (ny, nx, c) over the rows that count, and the largest of all."""
+    """Statistics of the absolute errors `off` (ny, nx, c): `p99` and `max` of the rows `counted`, `max_all` of all."""
     some = off[counted]
     return {"p99": float(np.quantile(some, 0.99)), "max": float(some.max()), "max_all": float(off.max())}

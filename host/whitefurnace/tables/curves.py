@@ -1,5 +1,5 @@
-"""Simple curves in place of what is costly: Smith's term of any NDF by a rational function, and the norm of an NDF by a
-polynomial, both fitted for the least largest error and written as C and GLSL."""
+"""Simple curves that replace costly functions in shaders: a rational function for Smith's term of any NDF, and a
+polynomial for the norm of an NDF. Both are fitted for the smallest maximum error and written as C and GLSL."""
 from __future__ import annotations
 
 import math
@@ -20,28 +20,28 @@ from whitefurnace.tables.axes import Axis, Ends, Points
 from whitefurnace.tables.cells import Cells, Run
 
 TERMS = 6
-"""Coefficients of a polynomial in the roughness: GGX's k = α/2 is one of them, β² of others wants all."""
+"""Coefficients of a polynomial in the roughness. GGX needs one of them (k = α/2), other NDFs all."""
 
 DEGREES = range(1, 11)
-"""Total degrees of a norm's polynomial, of which the least that meets the tolerance is taken."""
+"""Total degrees of a norm's polynomial. The least that meets the tolerance is taken."""
 
 POWERS = (2, 4, 8, 16, 32, 64)
-"""Of the sums |error|^p that are made small one after the other: the last is within 3 % of the largest error of 1e4
-points, with a derivative that the largest error has not."""
+"""Powers p of the sums Σ|error|^p that are minimized one after the other. The p-th root of the last is within 3 % of
+the largest error of 1e4 points, and unlike the largest error it has a derivative."""
 
 NORM_AXES: Mapping[str, Mapping[str, Ends]] = {
     "abc": {"b": (1.0, 1e6, 48, "log"), "c": (1.0, 3.0, 48, "linear")},
     "shifted_gamma": {"alpha": (1e-3, 1.0, 48, "log"), "p": (0.0, 2.0, 48, "linear")},
 }
-"""Ranges of the fitted norms; --axis gives others."""
+"""Default ranges of the parameters of the fitted norms, by NDF; --axis gives others."""
 
 LOBES = {"abc": "1/(1 + b (1 - cos θ))^c", "shifted_gamma": "exp(-t/alpha) (1 + t/alpha²)^-p / cos⁴θ, t = tan²θ"}
-"""What the norms are of, for the comment of a header."""
+"""The lobe that each norm belongs to, for the comment of a header."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """A variable of a fit: its values, and in x of them, from -1 to 1, whether by the logarithm."""
+    """A variable of a fit, which a call maps from [low, high] to [-1, 1], by its logarithm if `log`."""
 
     name: str
     low: float
@@ -59,8 +59,11 @@ class Span:
 
 
 def least_largest(residuals: Callable[[np.ndarray], np.ndarray], start: np.ndarray, steps: int = 40) -> np.ndarray:
-    """Parameters with about the least largest |residual|: sums of powers of the residuals, each from the solution of
-    the one before, by damped Gauss-Newton steps with a derivative by differences. [Marquardt1963]"""
+    """Parameters for which the largest |residual| is about as small as can be, from those of `start`.
+
+    Sums of growing powers of the residuals are minimized one after the other, by damped Gauss-Newton steps with a
+    numerical derivative. [Marquardt1963]
+    """
     best = at = start.astype(np.float64)
     now = residuals(at)
     least = float(np.abs(now).max())
@@ -100,7 +103,7 @@ def least_largest(residuals: Callable[[np.ndarray], np.ndarray], start: np.ndarr
 
 
 def smith_check(slots: Mapping[str, Chosen]) -> None:
-    """Raises UnsupportedError for what has no Smith term of n·v alone."""
+    """Raise UnsupportedError for models whose Smith term does not depend on n·v alone."""
     ndf, masking = slots["ndf"].model, slots["masking"].model
     if not ndf.isotropic:
         raise UnsupportedError(f"smith wants an isotropic ndf; {ndf.name} is anisotropic")
@@ -109,7 +112,10 @@ def smith_check(slots: Mapping[str, Chosen]) -> None:
 
 
 def shape_of_smith(scheme: str | None, axes: Sequence[Axis]) -> tuple[int, ...]:
-    """(polynomials, coefficients); one coefficient where nothing but n·v varies."""
+    """Shape (polynomials, coefficients) of a fit of Smith's term; one coefficient if nothing but n·v varies.
+
+    Raises UnsupportedError for axes other than NoV and at most one more.
+    """
     others = [axis.name for axis in axes if axis.name != "NoV"]
     if len(others) > 1 or len(others) == len(axes):
         raise UnsupportedError("smith is fitted over NoV and one parameter more, not "
@@ -118,12 +124,14 @@ def shape_of_smith(scheme: str | None, axes: Sequence[Axis]) -> tuple[int, ...]:
 
 
 def area(scheme: str | None, c: np.ndarray, k: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """The fitted A(c) = c/G1(c): c + k (1 - c), bent by q/(q + c) where the scheme has it."""
+    """The fitted A(c) = c/G1(c) = c + k (1 - c), times q/(q + c) in the second term for the scheme "rational"."""
     return c + k * (1 - c) * (q / (q + c) if scheme == "rational" else 1)
 
 
 def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, Any]]:
-    """(polynomials, coefficients) of k, and q, in the parameter x: G1(c) = c/A(c), A = c + k(1 - c) q/(q + c).
+    """Coefficients (polynomials, coefficients) of k, and q, as polynomials in the parameter x.
+
+    The fit is G1(c) = c/A(c), A = c + k (1 - c) q/(q + c), c = n·v.
 
     With q left out and k = α/2 it is Hammon's approximation of GGX's height-correlated term. [Hammon2017]
     """
@@ -217,13 +225,13 @@ def _pairs(scheme: str | None, k: np.ndarray, q: np.ndarray, c: np.ndarray, A: n
 
 
 def norm_axes(slots: Mapping[str, Chosen]) -> Mapping[str, Ends]:
-    """The usual ranges of the parameters that are not given with the NDF."""
+    """The default ranges of the parameters that are not given with the NDF."""
     ndf = slots["ndf"]
     return {name: axis for name, axis in NORM_AXES.get(ndf.model.name, {}).items() if name not in ndf.given}
 
 
 def norm_check(slots: Mapping[str, Chosen]) -> None:
-    """Raises UnsupportedError for an NDF whose norm is no number that its parameters give."""
+    """Raise UnsupportedError for an NDF that has no costly norm."""
     entry = slots["ndf"].model
     if not {"norm", "per_norm"} & set(entry.constant_names):
         raise UnsupportedError(f"norm is of an NDF with a norm that costs: {', '.join(NORM_AXES)} or a .clh file; "
@@ -231,15 +239,21 @@ def norm_check(slots: Mapping[str, Chosen]) -> None:
 
 
 def shape_of_norm(axes: Sequence[Axis]) -> tuple[int, ...]:
-    """(1, coefficients) or (coefficients of one, of the other) at the highest degree; the rest are 0."""
+    """Shape (coefficients,) or (coefficients of x, of y) of a norm's polynomial of the highest degree.
+
+    Coefficients beyond the degree that is taken are 0. Raises UnsupportedError for more than two axes.
+    """
     if not 1 <= len(axes) <= 2:
         raise UnsupportedError(f"norm is fitted over one or two parameters, not {len(axes)}: fix the others with --set")
     return tuple(DEGREES.stop for _ in axes)
 
 
 def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, Any]]:
-    """(n,) or (n, n): ln of the norm as a polynomial in the parameters, each from -1 to 1 of its range or of the log of
-    it; [i, j] is of x^i y^j, x the first axis. The least degree that meets the tolerance, relative to the norm."""
+    """Coefficients (n,) or (n, n) of a polynomial for ln of the norm, in one or two parameters.
+
+    Each parameter is mapped from its range, or the logarithm of it, to [-1, 1]. [i, j] is the coefficient of x^i y^j, x
+    being the first axis. The degree is the least that meets the tolerance, which is relative to the norm.
+    """
     start, ndf, axes = time.perf_counter(), cells.models["ndf"], cells.axes
     entry = ndf.model
     which = len(entry.parameters) + next(i for i, n in enumerate(entry.constant_names) if n in ("norm", "per_norm"))

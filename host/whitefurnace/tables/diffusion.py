@@ -1,5 +1,4 @@
-"""Pre-integrated diffusion: diffuse light on a curved body whose light leaves elsewhere than it enters, by curvature.
-[Penner2011]
+"""Pre-integrated diffusion: diffuse light on a curved body of a translucent medium, by curvature. [Penner2011]
 
 Written in numpy and not as a kernel: for each curvature the integral is a sum of a few hundred values of the profile
 with weights that no row changes, so a table is one product of two matrices.
@@ -29,16 +28,16 @@ DOMAINS = {"absorption": (0.0, 1e6), "scattering": (0.0, 1e6), "albedo": (1e-3, 
            "g": (-0.99, 0.99), "ior": (1.0, 3.0)}
 
 NODES = (14, 20)
-"""Gauss nodes of a panel, of the rule that tells the error and of the one that is kept."""
+"""Gauss nodes of a panel: of the rule for the error estimate, and of the rule whose values are kept."""
 
 LEFT = {32: 3e-8, 64: 1e-14}
-"""What the format leaves, of float64 the sums: some of 1e-15 that cancel."""
+"""Rounding error by precision: that of the format in float32, that of the sums in float64."""
 
 FLAT = 1e-13
-"""Where the profile is narrower than this on a circle of radius 1, the body is flat: D differs by as much."""
+"""Width of the profile on a circle of radius 1 below which the body counts as flat; D then differs by as much."""
 
 ROWS, COLUMNS = 64, 1024
-"""Curvatures and cosines at once: some ten MB."""
+"""Curvatures and cosines that are computed at once, in some ten MB."""
 
 
 def profile(scheme: str | None, given: Mapping[str, float]) -> Profile:
@@ -97,7 +96,7 @@ def _rgb(name: str, given: Mapping[str, float], default: float | None = None) ->
 
 
 def diffusion_spec(scheme: str | None, columns: Mapping[str, np.ndarray]) -> TableSpec:
-    """What `diffusion` would do, checked without a device. Raises UsageError."""
+    """The shape of what `diffusion` computes. Raises UsageError for parameters that do not fit the scheme."""
     _parts(scheme, columns)
     return TableSpec(integral("normalization"), {}, (*np.broadcast_shapes(*(c.shape for c in columns.values())), 3), ())
 
@@ -120,7 +119,9 @@ def _parts(scheme: str | None, columns: Mapping[str, np.ndarray]) -> tuple[np.nd
 def diffusion(scheme: str | None, report: bool, *, out: np.ndarray | None, precision: int, tolerance: float,
               NoL: np.ndarray, curvature: np.ndarray, device: Any = None, backfacing: str | None = None,
               **others: np.ndarray) -> tuple[Integrated, dict[str, Any]]:
-    """(…, 3): D(θ, κ) = ∫ q(2 sin(x/2)/κ) max(cos(θ + x), 0) dx / ∫ q dx over x from -π to π, θ = acos NoL.
+    """Diffuse light D (…, 3) by the cosine NoL of the light and the curvature κ in 1/mm.
+
+    D(θ, κ) = ∫ q(2 sin(x/2)/κ) max(cos(θ + x), 0) dx / ∫ q dx over x from -π to π, θ = acos NoL.
 
     q is the profile's line spread: the body is a cylinder of curvature κ, lit and shaded alike along its axis, and what
     reaches a line is R integrated along the other. Of Gaussians it is what is usually tabulated; of Christensen and
@@ -153,7 +154,7 @@ def _stated(found: Profile) -> dict[str, Any]:
 
 
 def integrated(found: Profile, NoL: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float, int]:
-    """D of each curvature and cosine, (rows, columns, 3), the error left and the nodes of a row."""
+    """D of each curvature and cosine, (rows, columns, 3), its absolute error, and the number of nodes of a row."""
     values = np.empty((curvature.size, NoL.size, 3))
     flat = curvature * found.widest < FLAT
     values[flat] = np.maximum(NoL, 0)[:, None]

@@ -1,4 +1,5 @@
-"""Tables of energy: what single scattering loses and how three schemes give it back, and the albedo of sheen."""
+"""The energy that single scattering loses, in the forms of three schemes that restore it; the albedo of sheen; and the
+average of a Fresnel term."""
 from __future__ import annotations
 
 import time
@@ -20,21 +21,22 @@ from whitefurnace.opencl.launch import evaluate
 from whitefurnace.results import Integrated
 
 FINE = 1e-11
-"""The tolerance of albedos whose complements are told, in float64: at α = 1e-5 what is lost on average is 1e-9."""
+"""Tolerance, in float64, of albedos whose complements are tabulated: at α = 1e-5 the average loss is 1e-9."""
 
 PAIRS = 5e-6
-"""The tolerance of split-sum pairs."""
+"""Tolerance of the split-sum pairs."""
 
 F0 = (0.04, 0.5, 0.9, 1.0)
-"""Reflectances at which schemes are compared."""
+"""Reflectances at which the schemes are compared."""
 
 HALVINGS = 30
 SETTLED = 1e-14
 AT_ONCE = 1024
-"""How often a panel of Fresnel's average is halved at most, the change that ends it, and how many are done at once."""
+"""Of the average of a Fresnel term: the most halvings of a panel, the change that ends them, and the number of cells
+that are computed at once."""
 
 CHECK = 96
-"""Nodes of the furnace's own average, in another variable than the table's."""
+"""Nodes of the average that checks the furnace, in another variable than that of the table."""
 
 
 def _without_view(columns: Mapping[str, Any]) -> dict[str, Any]:
@@ -70,8 +72,14 @@ def _joined(first: Integrated, *others: Integrated) -> Integrated:
 
 
 def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
-    """(…, 2): kulla_conty (1 - E, 1 - E_avg), complements because float32 does not hold what is lost at α < .01 beside
-    1; turquin (E, 1/E - 1); fdez_aguera the split-sum pair. [KullaConty2017; Turquin2019; FdezAguera2019]"""
+    """The table of a scheme, (…, 2), and what is stated of it if `report`.
+
+    scheme: "kulla_conty" gives (1 - E, 1 - E_avg), since float32 cannot hold the loss at α < .01 as a difference from
+        1; "turquin" gives (E, 1/E - 1); "fdez_aguera" gives the split-sum pair.
+    what: arguments of `integrate`.
+
+    Raises UnsupportedError for a BRDF that reflects more than arrives. [KullaConty2017; Turquin2019; FdezAguera2019]
+    """
     E, mean = _albedos(what)
     lost, lost_avg = np.maximum(1 - E.values, 0), np.maximum(1 - mean.values, 0)
     pairs = integrate("dfg", **{**what, "precision": 32, "tolerance": PAIRS, "out": None}) if \
@@ -129,7 +137,10 @@ def _apart(values: np.ndarray) -> float:
 
 
 def sheen(report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
-    """(…, 2): E(v) and E_avg of a sheen of colour 1, for the scaling of what lies under it. [Estevez2017]"""
+    """Albedo E(v) and its average E_avg, (…, 2), of a sheen of colour 1, which scale the layer below. [Estevez2017]
+
+    what: arguments of `integrate`. Raises UnsupportedError for a sheen that reflects more than arrives.
+    """
     own = {**what, "out": None}
     E = integrate("albedo", **own)
     mean = integrate("albedo_average", **{k: v for k, v in _without_view(own).items() if k != "backfacing"})
@@ -146,7 +157,7 @@ def _grid(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> Grid:
 
 
 def fresnel_spec(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> TableSpec:
-    """What `fresnel_average` would do, checked without a device."""
+    """The shape and the kernels of `fresnel_average`. Raises UsageError for parameters outside their domain."""
     slots = {"fresnel": models["fresnel"].model}
     return TableSpec(integral("albedo_average"), models, _grid(models, columns).shape,
                   (source.evaluation("FRESNEL_F", slots).digest,))
@@ -184,7 +195,7 @@ def _halved(F: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int,
 
 def fresnel_average(*, fresnel: Chosen, out: np.ndarray | None, precision: int, tolerance: float, device: Device,
                     backfacing: str | None = None, **columns: Any) -> Integrated:
-    """(…): F_avg = 2∫ F(μ) μ dμ to 1e-6 or better."""
+    """The average F_avg = 2∫ F(μ) μ dμ, (…), to 1e-6 or better."""
     start, entry = time.perf_counter(), fresnel.model
     slots, grid = {"fresnel": entry}, _grid({"fresnel": fresnel}, columns)
     finest = 64 if device.fp64 else 32

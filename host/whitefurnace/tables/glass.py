@@ -1,4 +1,4 @@
-"""Tables of rough glass: what a boundary of two insulators reflects and lets through, over the view, roughness and
+"""Rough glass: the shares of light that a boundary of two insulators reflects and transmits, by view, roughness and
 index of refraction."""
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from whitefurnace.opencl.launch import CELLS_A_LAUNCH
 from whitefurnace.results import Integrated
 
 TOLERANCE = 1e-5
-"""The usual tolerance of float32 tables, and the least that float32 is asked for: finer ones are made in float64."""
+"""Default tolerance of float32 tables. Finer tolerances are computed in float64."""
 
 LOST = 4e-6
-"""What float32 loses of R and T besides, at grazing over narrow lobes: 3.5e-6 at most over the NDFs of the catalogue
-(tests/test_tables_glass.py)."""
+"""Rounding error of R and T in float32 at grazing angles over narrow lobes: 3.5e-6 at most over the NDFs of the
+catalogue (tests/tables/test_glass.py)."""
 
 
 @dataclass
@@ -49,8 +49,7 @@ class Boundary(Part):
 
 
 def check(slots: Mapping[str, Chosen]) -> None:
-    """Raises UnsupportedError for models whose masking says nothing of light on the other side, or which have an
-    azimuth."""
+    """Raise UnsupportedError for an anisotropic NDF, or a masking that is not a product of one term a direction."""
     ndf, masking = slots["ndf"].model, slots["masking"].model
     if not ndf.isotropic:
         raise UnsupportedError(f"glass wants an isotropic ndf; {ndf.name} is anisotropic")
@@ -60,14 +59,18 @@ def check(slots: Mapping[str, Chosen]) -> None:
 
 
 def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
-    """Of the kernels, for the key of a table."""
+    """Digests of the kernels, for the key of a table."""
     return (source.refraction({slot: choice.model for slot, choice in slots.items()}).digest,)
 
 
 def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, out: np.ndarray | None,
           precision: int, tolerance: float, device: Device, backfacing: str | None = None,
           **columns: Any) -> tuple[Integrated, dict[str, Any]]:
-    """(…, 2): the shares R and T of the energy that arrives along v, single scattering. [Walter2007]"""
+    """Shares R and T (…, 2) of the energy that arrives along v, for single scattering. [Walter2007]
+
+    scheme: "entering" for light from the side of index 1, "leaving" for light from the other side, where Fresnel's n is
+    1/ior. The second value is what is stated of the table if `report`. Raises UnsupportedError.
+    """
     start = time.perf_counter()
     slots = {"ndf": ndf, "masking": masking, "fresnel": fresnel}
     check(slots)

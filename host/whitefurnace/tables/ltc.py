@@ -58,7 +58,7 @@ ADOPTED = 0.98
 
 @dataclass(frozen=True)
 class Lobes:
-    """Cells of a BRDF on a device: `rows` as the kernels of ltc.cl read them, the matrix's four rows among them."""
+    """Cells of a BRDF on a device. `rows` are what the kernels of ltc.cl read, with four rows for the matrix."""
 
     device: Device
     text: str
@@ -98,7 +98,7 @@ class Lobes:
 
 
 def horizon(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of matrices (4, n) the energy b below the horizon, (n,), and its gradient in δ of N <- (1 + δ) N, (4, n).
+    """The energy b below the horizon, (n,), of matrices N (4, n), and its gradient (4, n) in δ of N <- (1 + δ) N.
 
     The lobe's half u.z > 0 meets the half space ω.z > 0 where m·u > 0, m = N⁻ᵀ z: a cosine lobe cut by a plane through
     its origin holds (1 + m.z/|m|)/2. A step turns m by -δᵀ m.
@@ -113,7 +113,8 @@ def horizon(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class Fit:
-    """Where a fit stands: matrices (4, n), the m of the current rule, (n,), and l̄ as its x and z, (2, n)."""
+    """The state of a fit: matrices (4, n), the misplaced energy m (n,) by the current rule, and x and z of the mean
+    direction l̄, (2, n)."""
 
     N: np.ndarray
     m: np.ndarray
@@ -144,7 +145,7 @@ def _moved(N: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 def descend(lobes: Lobes, fit: Fit, which: np.ndarray, free: bool, stage: tuple[Rule, float, int]) -> None:
-    """Levenberg's and Marquardt's steps of every cell of `which` by itself, all cells at a time, in place.
+    """Improve the matrices of the cells `which` in place, by Levenberg-Marquardt steps, all cells at a time.
 
     Without `free` the row of w.z keeps its direction: δ.zx = 0.
     """
@@ -237,7 +238,7 @@ def _from_neighbours(lobes: Lobes, fit: Fit, shape: tuple[int, ...], width: np.n
 
 
 def fit_lobes(lobes: Lobes, shape: tuple[int, ...], width: np.ndarray, scheme: str) -> Fit:
-    """Matrices (4, n) of all cells, that lie in a grid of `shape`; width (n,) are the angles of the NDF."""
+    """Fit the matrices (4, n) of all cells of a grid of `shape`. width: (n,) angles of the NDF in radians."""
     free = scheme == "free"
     fit, which = _start(lobes, width), np.arange(lobes.count)
     for stage in STAGES:
@@ -250,13 +251,13 @@ def fit_lobes(lobes: Lobes, shape: tuple[int, ...], width: np.ndarray, scheme: s
 
 
 def check(slots: Mapping[str, Chosen]) -> None:
-    """Raises UnsupportedError for an NDF with an azimuth: its lobes want all of a matrix, and a third axis."""
+    """Raise UnsupportedError for an anisotropic NDF: its lobes need a full matrix and a third axis."""
     if not slots["ndf"].model.isotropic:
         raise UnsupportedError(f"ltc wants an isotropic ndf; {slots['ndf'].model.name} is anisotropic")
 
 
 def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
-    """Of the kernels, for the key of a table."""
+    """Digests of the kernels, for the key of a table."""
     models = {slot: slots[slot].model for slot in ("ndf", "masking", "fresnel")}
     pair, both = integral("dfg"), {slot: models[slot] for slot in ("ndf", "masking")}
     closed = own_kernel_of(pair, both)
@@ -266,7 +267,7 @@ def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
 
 def lobes_of(device: Device, models: Mapping[str, Chosen], albedo: np.ndarray,
              columns: Mapping[str, Any]) -> tuple[Lobes, np.ndarray]:
-    """The cells of a grid of parameters whose albedos are known, and the widths of their NDF."""
+    """The cells of a grid of parameters with known albedos, and the angular widths (n,) of their NDF in radians."""
     entry, precision = integral("albedo"), finest(device)
     slots = {slot: models[slot] for slot in ("ndf", "masking", "fresnel")}
     grid = grid_of(entry, slots, dict(columns), None)
@@ -281,8 +282,9 @@ def lobes_of(device: Device, models: Mapping[str, Chosen], albedo: np.ndarray,
 
 
 def sphere_form_factor(z: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """The share of its form factor that a sphere shows above the horizon: what clips a polygon, as a sphere of the same
-    vector form factor, in engines that read it from the table [Heitz2016, sec. 6; Snyder1996].
+    """The form factor of a sphere cut by the horizon, over that of the whole sphere. [Heitz2016, sec. 6; Snyder1996]
+
+    Engines clip a polygon with it, as a sphere of the same vector form factor.
 
     z: cosine from the normal to the sphere's middle; length: sin² of the angle σ of its radius. Broadcast.
     """
@@ -319,7 +321,7 @@ def _four(values: np.ndarray) -> np.ndarray:
 
 def matrices(scheme: str, device: Device, models: Mapping[str, Chosen], albedo: np.ndarray,
              columns: Mapping[str, Any]) -> tuple[np.ndarray, Lobes]:
-    """(4, …) float64 of xx, xz, zx, zz over the broadcast parameters, and the cells they were fitted to."""
+    """The fitted matrices (4, …), float64, as xx, xz, zx, zz over the broadcast parameters, and their cells."""
     lobes, width = lobes_of(device, models, albedo, columns)
     fit = fit_lobes(lobes, np.shape(albedo), width, scheme)
     return fit.N.reshape(4, *np.shape(albedo)), lobes
@@ -329,7 +331,9 @@ def ltc(kind: str, names: Sequence[str], scheme: str | None, report: bool, *, nd
         fresnel: Chosen, device: Device, precision: int, tolerance: float, out: np.ndarray | None,
         backfacing: str | None = None, middle: Mapping[str, Any] | None = None,
         **columns: Any) -> tuple[Integrated, dict[str, Any]]:
-    """(…, c) of the channels `names`: of ltc_1 the matrix, of ltc_2 (norm, Fresnel, 0, sphere), of ltc both.
+    """The channels `names` of a table, (…, c), and what is stated of it if `report`.
+
+    ltc_1 holds the matrix, ltc_2 (norm, Fresnel, 0, sphere), ltc both.
 
     norm and Fresnel are ∫ f (n·l) dω with F = 1 and with F = (1 - v·h)⁵, so that a light of radiance 1 over the polygon
     P is seen as (F0 norm + (1 - F0) Fresnel) ∫_P p dω. The sphere's table is over axes of its own: x is the cosine from

@@ -29,7 +29,7 @@ CHANNELS: Mapping[str, tuple[tuple[str, str], str]] = {
 
 @dataclass(frozen=True)
 class SplitSum:
-    """The table of a preset.
+    """The split-sum table of an engine.
 
     values: (size, size, 2 or 3) float32, row y, column x, as the engine reads them. error: bound of the absolute error
     of the first two channels. charlie_error: that of the third channel, 0 without one.
@@ -44,7 +44,7 @@ class SplitSum:
 
 def laid_out(form: str, pair: Mapping[str, Any], cloth: Mapping[str, Any] | None = None,
              progress: Callable[[float], None] | None = None) -> tuple[Integrated, float]:
-    """The pair in a form, […, 2], or with Charlie's albedo as a third channel, and the error of that channel.
+    """Compute the pair in a form, […, 2], or with Charlie's albedo as a third channel, and the error of that channel.
 
     form: a key of `CHANNELS`. pair: arguments of `integrate` for the pair. cloth: those for Charlie's albedo, or None
     where it is no channel; its tolerance is at least `CHARLIE`. Raises as `integrate` does.
@@ -72,14 +72,14 @@ def charlie(cells: Cells) -> dict[str, Any]:
 
 
 def axis_values(name: str, spacing: str, size: int) -> np.ndarray:
-    """(size,) what the texels of an axis stand for: centres (k + ½)/size, and of NoV with `sqrt` (k/(size - 1))²."""
+    """Parameter values (size,) of the texels of an axis: (k + ½)/size, or (k/(size - 1))² for NoV spaced by "sqrt"."""
     if name == "NoV" and spacing == "sqrt":
         return (np.arange(size) / max(size - 1, 1)) ** 2
     return (np.arange(size) + 0.5) / size
 
 
 def split_sum(table: Dfg, *, device: Device, ndf: Spec = "ggx", masking: Spec = "smith") -> SplitSum:
-    """The table of a preset, in float32. Raises as `integrate` does."""
+    """Compute the split-sum table of an engine, in float32. Raises as `integrate` does."""
     x, y = (axis_values(name, table.NoV, table.size) for name in (table.x, table.y))
     across = {table.x: np.broadcast_to(x[None], (table.size, table.size)),
               table.y: np.broadcast_to(y[:, None], (table.size, table.size))}
