@@ -1,7 +1,7 @@
 # Sets everything up in .venv and bakes, tests, benchmarks or lints with the wheel of this tree.
 #
 #   make [bake] [ENV=image] [OUT=folder] [ARGS='--size 512 ...']     bakes the demo or your environment
-#   make test | test-all [ARGS='-k name']                            test-all: those that take minutes too
+#   make test | test-long | test-all [ARGS='-k name']                minutes | those that take longer | both
 #   make test-plain                                                  the wheel without any extra
 #   make test-engines                                                three.js, Babylon.js, Filament in Chromium
 #   make bench | lint | devices | clean
@@ -23,7 +23,7 @@ SOURCES := setup.cfg pyproject.toml LICENSE $(wildcard README.md) \
 .ONESHELL:
 .SHELLFLAGS = -ec
 .DELETE_ON_ERROR:
-.PHONY: bake test test-all test-plain test-engines bench lint devices clean
+.PHONY: bake test test-long test-all test-plain test-engines bench lint devices clean
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 # What is tested is the wheel, whatever the caller's shell has on its path.
 unexport PYTHONPATH
@@ -31,11 +31,18 @@ unexport PYTHONPATH
 bake: $(VENV)/device.done
 	@$(BIN)/whitefurnace bake "$(ENV)" -o "$(OUT)" $(ARGS)
 
+# Two processes are as many as PoCL's own threads leave room for on two cores; more do not pay on four.
+PYTEST = $(BIN)/pytest -n 2 --dist worksteal
+
+# An engine's page costs seconds of a browser: `make test-engines` runs those.
 test: $(VENV)/device.done $(VENV)/test.done
-	@$(BIN)/pytest -m "not long" $(ARGS) tests
+	@$(PYTEST) -m "not long and not engines" $(ARGS) tests
+
+test-long: $(VENV)/device.done $(VENV)/test.done
+	@$(PYTEST) -m "long and not engines" --durations=10 $(ARGS) tests
 
 test-all: $(VENV)/device.done $(VENV)/test.done
-	@$(BIN)/pytest $(ARGS) tests
+	@$(PYTEST) --durations=10 $(ARGS) tests
 
 # An environment that has the wheel alone; a runtime from pip comes along where the system has none.
 test-plain: $(VENV)/device.done

@@ -19,6 +19,50 @@ def pytest_configure(config: pytest.Config) -> None:
         os.environ["POCL_CACHE_DIR"] = str(config.cache.mkdir(f"pocl-{worker}"))
 
 
+KERNEL_TESTS = {"catalogue", "integrals", "opencl", "prefiltering"}
+"""Folders whose tests run on every device in the fast suite too, one member of each."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks as long those members of parametrized tests that prove little more than the others of their test.
+
+    A member that shows no new value of any parameter is one: of 9 NDFs × 7 maskings the fast suite takes some 15, with
+    each NDF and each masking in at least one of them. A test marked `few(n)` keeps n members, evenly drawn; one marked
+    `whole` keeps all. A second device runs one member of each test of kernels.
+    """
+    tests: dict[str, list[pytest.Function]] = {}
+    for item in items:
+        if isinstance(item, pytest.Function) and hasattr(item, "callspec"):
+            tests.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    first = next(iter(working_devices()), None)
+    for members in tests.values():
+        here = [item for item in members if item.callspec.params.get("device", first) == first]
+        kept = _kept(here)
+        if members[0].path.parent.name in KERNEL_TESTS:
+            others = [item for item in members if item not in here]
+            kept += list({item.callspec.params["device"]: item for item in reversed(others)}.values())
+        for item in members:
+            if item not in kept:
+                item.add_marker("long")
+
+
+def _kept(members: list[pytest.Function]) -> list[pytest.Function]:
+    """The members of one test that the fast suite runs."""
+    if not members or members[0].get_closest_marker("whole"):
+        return members
+    if few := members[0].get_closest_marker("few"):
+        count = min(few.args[0], len(members))
+        return [members[k * len(members) // count] for k in range(count)]
+    kept, seen = [], set()
+    for item in members:
+        shown = {(name, repr(value)) for name, value in item.callspec.params.items()}
+        if not shown <= seen:
+            kept.append(item)
+            seen |= shown
+    return kept
+
+
 @functools.cache
 def working_devices() -> dict[str, Candidate]:
     """Every device whose probe gave the right answer, under a name fit for a test id."""

@@ -66,6 +66,7 @@ def main() -> int:
         print(f"This environment has {', '.join(present)}: it is no plain install and would prove nothing.")
         return 2
     import documents
+
     import public_calls
 
     failures = []
@@ -86,7 +87,9 @@ def main() -> int:
         for block in documents.python_blocks():
             check(f"the Python of {block.page}", _called(lambda text=block.text: exec(text, {})))
         check("every module can be imported", _called(public_calls.import_everything))
-        check("every public function can be called", _called(lambda: public_calls.call_everything(Path(folder) / "calls")))
+        calls = Path(folder) / "calls"
+        calls.mkdir()
+        check("every public function can be called", _called(lambda: public_calls.call_everything(calls)))
         os.chdir(os.path.dirname(os.path.abspath(__file__)))
     print(f"{len(failures)} failed" + (f": {'; '.join(failures)}" if failures else ""))
     return 1 if failures else 0

@@ -1,6 +1,8 @@
 """The README is true: its commands run, its Python runs, its generated parts are what the program says."""
 from __future__ import annotations
 
+import contextlib
+import io
 import re
 import shlex
 import subprocess
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 from scenes import helmet
+from whitefurnace.cli import main
 from whitefurnace.engines.presets import user_engine
 from whitefurnace.files import write_exr
 from whitefurnace.sphere.environments import LAYOUTS
@@ -29,7 +32,14 @@ def commands() -> list[str]:
 
 
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "whitefurnace", *arguments], cwd=cwd, capture_output=True, text=True)
+    """A command line in this process: a process of its own would start for a second."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.chdir(cwd or Path.cwd()), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main(list(arguments))
+        except SystemExit as done:
+            return subprocess.CompletedProcess(arguments, done.code, out.getvalue(), err.getvalue())
+    return subprocess.CompletedProcess(arguments, 0, out.getvalue(), err.getvalue())
 
 
 @pytest.fixture(scope="module")

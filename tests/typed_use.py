@@ -20,7 +20,7 @@ def use() -> None:
     assert_type(wf.dfg(8).error, float)
     assert_type(wf.sample("ggx", 4, alpha=0.1), np.ndarray)
     wf.environment(SKY, rotate=90.0)
-    wf.prefilter(SKY, size=8, min_size=4).values
+    assert_type(wf.prefilter(SKY, size=8, min_size=4).error, np.ndarray)
     wf.bake(SKY, "baked", size=8, min_size=4)
     wf.lut("dfg", "dfg.npy", size=8)
     wf.bake(SKY, "baked", size="large")  # type: ignore[arg-type]

@@ -71,6 +71,7 @@ def directions(texels: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------- closed forms
 
 
+@pytest.mark.long
 def test_constant_light_leaves_only_the_model(device, tmp_path):
     """Every mean of constant light is that light: what the files and the split sum add is rounding. b10g11r11 and half
     floats hold 1 exactly; float32 sums of some 10⁴ terms keep 1e-5."""
@@ -207,6 +208,7 @@ def test_lobes_are_those_of_the_prefilter(meter, device):
 # ------------------------------------------------------------------------------------------------- the engine's picture
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["filament", "three", "bevy", "raw", "babylon"])
 def test_the_picture_is_that_of_the_files(name, device, tmp_path):
     """X is what `rendering.shade` makes of the files that a bake wrote, whose axes differ: float32 sums apart."""

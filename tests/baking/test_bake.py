@@ -710,14 +710,15 @@ def test_stopped_between_renames_the_next_run_needs_no_force(tmp_path, monkeypat
 
 
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is POSIX's")
-def test_killed_at_random_moments_the_next_run_needs_no_force(tmp_path):
+@pytest.mark.parametrize("times", [2, pytest.param(10, marks=pytest.mark.long)])
+def test_killed_at_random_moments_the_next_run_needs_no_force(tmp_path, times):
     rng = random.Random(5)
     source, out = image(tmp_path / "a.exr", noise(height=8)), tmp_path / "out"
     arguments = ("bake", source, "-o", out, *SMALL, "--for", "raw,exr", "--quiet")
     begin = time.monotonic()
     subprocess.run(command(*arguments), check=True)
     length = time.monotonic() - begin
-    for k in range(5):
+    for k in range(times):
         run = subprocess.Popen(command(*arguments, "--exposure", str(k + 1)))
         time.sleep(length * rng.uniform(0.3, 1.0))  # the first third is the start of Python
         run.kill()

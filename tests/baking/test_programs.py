@@ -52,6 +52,7 @@ def without_terms(text: str) -> str:
     return "\n".join(line for line in text.splitlines() if not line.startswith("#define AREA_TERMS"))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("options", [
     ("--for", "raw"), ("--for", "khronos"), ("--for", "exr", "--ndf", "phong"), ("--samples", "64"),
     ("--ndf", "{folder}/hat.clh")], ids=["ggx", "charlie", "phong", "samples", "own"])

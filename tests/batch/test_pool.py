@@ -587,16 +587,18 @@ def test_a_lost_scheduler_is_a_clear_end(scheduler, tmp_path, count):
     jobs = [Job(f"{k}", "hang compute" if k == count - 1 else "", str(folder)) for k in range(count)]
     found = []
 
-    def on_result(result):
-        found.append(result.name)
-        if len(found) == 3:
-            process.kill()
+    def kill_when_one_hangs():
+        _until(lambda: any(folder.glob("*.hangs")), "the item that hangs")  # the cluster may take it before others
+        process.kill()
 
+    killer = threading.Thread(target=kill_when_one_hangs)
+    killer.start()
     with pytest.raises(FileError) as caught:
-        pool.run(STAGES, jobs, scheduler=address, on_result=on_result)
+        pool.run(STAGES, jobs, scheduler=address, on_result=lambda result: found.append(result.name))
+    killer.join()
     assert str(caught.value) == (f"the scheduler at {address} is gone: {len(set(found))} items were done before; run "
                                  "it again to go on with the rest")
-    assert 3 <= len(found) < count
+    assert len(found) < count
 
 
 def test_content_is_sent_by_value_where_asked(cluster):
@@ -655,7 +657,8 @@ def test_an_interrupt_ends_a_run_on_a_cluster(scheduler, tmp_path):
     _until(lambda: list(folder.glob("*.hangs")), "an item on the worker")
     os.killpg(process.pid, signal.SIGINT)
     assert process.stdout is not None
-    assert "finishing what is in flight" in process.stdout.readline()
+    # On a busy machine it may have said before that it waits for workers.
+    assert any("finishing what is in flight" in line for line in iter(process.stdout.readline, ""))
     (folder / "release").touch()
     out, err = process.communicate(timeout=PATIENCE)
     lines = out.splitlines()

@@ -243,6 +243,7 @@ def check_quadrature(device: Device, name: str, masking: str, at_least: float, f
     assert_close(got.values, want, stated + doubt, columns, f"{context}, stated error")
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", [n for n in ISOTROPIC if n != "ggx"])
 def test_albedo_with_smith(device: Device, name: str) -> None:
     check_quadrature(device, name, "smith", 30)
@@ -254,6 +255,7 @@ def test_albedo_with_every_masking(device: Device, name: str, masking: str) -> N
     check_quadrature(device, name, masking, 3)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("masking", MASKINGS)
 @pytest.mark.parametrize("name", ANISOTROPIC)
 def test_albedo_of_anisotropic_ndfs(device: Device, name: str, masking: str) -> None:
@@ -318,6 +320,7 @@ def test_the_stated_error_is_not_less_than_the_true_one(device: Device, name: st
     assert got.error <= tolerance + 4e-6, (name, tolerance, got.rule, got.error)  # + rounding of values up to 2
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", NDFS)
 def test_one_cell_alone_states_its_error(device: Device, name: str) -> None:
     """A cell alone climbs by itself, and may meet two rules that err alike."""

@@ -393,6 +393,7 @@ def test_a_white_sky_over_a_black_ground_is_the_albedo_too(radiance: Any, device
     assert found.error < 2e-5
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("ndf, own, nodes", [("ggx", {"alpha": 0.4}, 60), ("ggx", {"alpha": 0.02}, 700),
                                              ("ggx_anisotropic", {"alpha_x": 0.1, "alpha_y": 0.4}, 160)])
 def test_lobes_in_an_environment_are_brute_force(radiance: Any, ndf: str, own: dict[str, float], nodes: int) -> None:
@@ -449,6 +450,7 @@ def test_one_bright_texel_is_a_punctual_light(radiance: Any) -> None:
     assert np.allclose(found.values, point.values * [1, 2, 3], rtol=2e-5)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("cube", [False, True])
 def test_a_mirror_shows_the_texel_times_fresnel(radiance: Any, cube: bool) -> None:
     rng = np.random.default_rng(2)

@@ -122,6 +122,7 @@ def by_matrix(size: int, alpha: float) -> np.ndarray:
     return matrix(size, alpha, (SUN,))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["sun", "panels"])
 @pytest.mark.parametrize("alpha", [0.06, 0.4])
 def test_what_is_stated_holds_95_times_in_100(device: Device, kind: str, alpha: float) -> None:

@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import binom
 
 import reference
-from whitefurnace import environment, prefilter
+from whitefurnace import prefilter
 from whitefurnace.catalogue import models
 from whitefurnace.errors import CheckError
 from whitefurnace.opencl.device import Device
@@ -168,15 +168,6 @@ def test_the_sharpest_level_of_noise_is_refused(device: Device) -> None:
     seen, with Beckmann and GTR too), which the certificate sees, so that nothing wrong is returned."""
     with pytest.raises(CheckError, match=r"level r = 0\.0\d+ .* has an error of .*, over the tolerance 0\.001"):
         prefilter(picture("fine noise"), rotate=33.0, device=device, **SHARPEST)
-
-
-@pytest.mark.long
-def test_the_sharpest_level_of_a_real_environment(device: Device, tmp_path: Path, environments: list[Path],
-                                                  monkeypatch: pytest.MonkeyPatch) -> None:
-    """A photograph's neighbouring texels differ less than noise, and the same grid holds the default tolerance."""
-    forest = environment(next(path for path in environments if "forest" in path.name))
-    monkeypatch.setitem(SOURCES, "forest", lambda: forest.texels)
-    check(device, "ggx", "forest", tmp_path, 6, **SHARPEST)
 
 
 @pytest.mark.parametrize("source", ["noise", "sun on an edge"])

@@ -182,6 +182,7 @@ def test_the_truth_is_true():
         np.testing.assert_allclose(M[pick] @ pixels.reshape(-1, 3).astype(np.float64), want, rtol=tolerance)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("kind", KINDS)
 def test_worst_and_rmse_are_what_they_say(kind):
     for c in cases(kind):

@@ -210,6 +210,7 @@ def test_every_ndf(device: Device, name: str) -> None:
     assert_level(level, shape, want, index, FLOAT32 + 50 * 3e-7, name)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("lanes", [1, 4, 16])
 @pytest.mark.parametrize("shape", [Shape(False, 4), Shape(False, 33), Shape(True, 4)], ids=str)
 def test_every_width(device: Device, monkeypatch: pytest.MonkeyPatch, shape: Shape, lanes: int) -> None:

@@ -25,6 +25,7 @@ def lost_by_1d(NoV: np.ndarray, alpha: float) -> np.ndarray:
     return 1 - reference.ggx_albedo_1d(NoV, np.full(len(NoV), alpha), 120, 2)[0]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("axes", [{}, {"NoV": "sqrt"}], ids=["centres", "sqrt"])
 def test_kulla_conty_comes_out_of_the_furnace_at_one(device: Device, tmp_path: Path, axes: dict[str, str]) -> None:
     """∫ (f + f_ms)(n·l) dω = 1 to 1e-4 at texel centres, f and E(l) by the 1-D form, the rest from the table."""
@@ -91,6 +92,7 @@ def test_sheen(device: Device, tmp_path: Path) -> None:
     assert np.ptp(table[..., 1], axis=1).max() == 0 and made.manifest["largest"] <= 1
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("ndf, masking", [("beckmann", "smith"), ("gtr:gamma=1.7", "smith_separable")])
 def test_any_ndf_has_its_compensation(device: Device, tmp_path: Path, ndf: str, masking: str) -> None:
     made = lut("energy", tmp_path / "e.npy", size=6, ndf=ndf, masking=masking, device=device)

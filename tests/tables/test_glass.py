@@ -76,6 +76,7 @@ def test_the_btdf_over_directions(device: Device, tmp_path: Path, n: float) -> N
             assert np.abs(got[k] - want).max() <= (2e-6 if n > 1 else 3e-5), (alpha, n, NoV, got[k], want)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("ndf", ["ggx", "beckmann", "abc:c=1.3", "charlie"])
 def test_no_boundary_is_the_masking_alone(device: Device, tmp_path: Path, ndf: str) -> None:
     """n = 1: nothing is reflected and l = -v, so T = ∫ D (v·m) dω · V(v, -v) n·v = A/(2A - n·v)."""
@@ -99,6 +100,7 @@ def test_smooth_glass_is_fresnels(device: Device, tmp_path: Path) -> None:
         assert np.abs(got[some] - np.stack([F, 1 - F], 1)[some]).max() <= 1e-5, (n, got, F)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("ndf", ["ggx", "shifted_gamma:p=1.5"])
 def test_as_much_goes_in_as_comes_out(device: Device, tmp_path: Path, ndf: str) -> None:
     """∫ T(n, μ) 2μ dμ = n² ∫ T(1/n, μ) 2μ dμ: f_t/n² is reciprocal. [Walter2007, sec. 4.3]"""

@@ -313,6 +313,7 @@ def test_it_is_the_same_every_time_and_in_two_textures(device: Device, tmp_path:
 # ---------------------------------------------------------------------------------------------- models, axes, refusals
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("options", [{"ndf": "beckmann"}, {"ndf": "gtr:gamma=1.8", "masking": "smith_separable"},
                                      {"ndf": "charlie", "axes": {"alpha": (0.2, 1, 4)}}, {"masking": "kelemen"}],
                          ids=lambda o: "-".join(map(str, o.values())))

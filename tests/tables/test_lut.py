@@ -364,6 +364,7 @@ def test_ctrl_c_leaves_what_was_there(tmp_path, suffix):
     assert tree(tmp_path) == before
 
 
+@pytest.mark.long
 def test_a_large_table_takes_little_memory(tmp_path):
     """4 million cells, 33 MB, in at most 16 MB more than a small table takes."""
     resource = pytest.importorskip("resource")

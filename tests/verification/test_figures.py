@@ -49,6 +49,7 @@ def colours(path: Path) -> int:
     return len(np.unique(np.round(pixels.reshape(-1, pixels.shape[-1]), 3), axis=0))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("slot, name", [("ndf", "gtr"), ("ndf", "beckmann_anisotropic"),
                                         ("masking", "schlick_smith"), ("fresnel", "schlick"), ("fresnel", "dielectric"),
                                         ("fresnel", "one"), ("diffuse", "minnaert")])
@@ -60,6 +61,7 @@ def test_a_figure_a_model(device: Device, tmp_path: Path, slot: str, name: str) 
     assert colours(tmp_path / f"figures/{slot}_{name}.png") > 20
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("slot, name, text, parameters", [
     ("ndf", "lobe", LOBE, {"spread": 0.3}), ("ndf", "lobe", LOBE, {}), ("ndf", "bare", BARE, {}),
     ("ndf", "steep", STEEP, {}), ("brdf", "paint", PAINT, {"gloss": 0.4})],
