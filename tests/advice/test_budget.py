@@ -16,6 +16,7 @@ from scenes import document
 from whitefurnace import integrate
 from whitefurnace.advice.budget import ACCURACY, Meter, of_image, sampled, usual
 from whitefurnace.baking import bake as baking
+from whitefurnace.baking.request import BakeRequest
 from whitefurnace.catalogue import model
 from whitefurnace.cli import main
 from whitefurnace.engines.presets import ENGINES, reduced
@@ -269,7 +270,7 @@ def test_the_choice_is_within_and_no_dearer_when_looser(meter, tmp_path):
     for one in made:
         assert one.met and one.error <= one.tolerance, one
         own = dict(one.options)
-        order = baking.order(["x.exr"], tmp_path, for_="filament", **own)  # they are options of bake
+        order = baking.plan(BakeRequest(["x.exr"], tmp_path, for_="filament", **own))  # they are options of bake
         assert order.chains[0].size == one.recipe.size and order.chains[0].levels == one.recipe.levels
     assert made[0].met and made[0].nbytes <= made[1].nbytes <= made[2].nbytes
     assert made[0].nbytes < made[0].usual_nbytes

@@ -3,7 +3,9 @@ anything half-written."""
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import hashlib
+import inspect
 import json
 import math
 import os
@@ -22,6 +24,7 @@ import pytest
 from reference import cube_directions
 from shell import command, mounted, tree
 from whitefurnace import bake, dfg, prefilter
+from whitefurnace.baking.request import BakeRequest
 from whitefurnace.errors import UsageError
 from whitefurnace.files import Transaction, write_exr
 from whitefurnace.opencl import source as kernels
@@ -883,3 +886,19 @@ def test_kernels_are_of_the_files_that_the_key_is_of(tmp_path, device, monkeypat
     unknown = {line for text in built for line in text.splitlines()
                if line not in lines and not line.startswith(("#line", "#define"))}
     assert not unknown
+
+
+def test_bake_and_its_request_have_the_same_options():
+    """The public function spells them out for editors and mypy; both lists are this test's to keep equal."""
+    spelled = inspect.signature(bake).parameters
+    asked = {field.name: field.default for field in dataclasses.fields(BakeRequest)}
+    own = {"device", "dry_run", "progress"}
+    assert [name for name in spelled if name not in own] == list(asked)
+    for name, default in asked.items():
+        if default is not dataclasses.MISSING:
+            assert spelled[name].default == default, name
+
+
+def test_an_unknown_option_is_refused_by_python(tmp_path):
+    with pytest.raises(TypeError, match="sizes"):
+        bake(noise(), tmp_path, sizes=32)

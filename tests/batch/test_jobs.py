@@ -22,6 +22,7 @@ import pytest
 from shell import command, mounted, tree
 from whitefurnace import bake
 from whitefurnace.baking import bake as baking
+from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import jobs as batch
 from whitefurnace.errors import FileError
 from whitefurnace.files import acquire, lock_path, write_exr
@@ -700,7 +701,7 @@ def test_the_digest_without_decoding_is_that_of_the_environment(tmp_path, form):
     assert source_digest(path) == env.digest
     assert extent(path) == (env.kind, *env.texels.shape[-3:-1])
     assert bake(path, tmp_path / "once", **OPTIONS)[0].state == "done"
-    assert baking.status(baking.order([path], tmp_path / "once", **OPTIONS), 0).state == "skipped"
+    assert baking.status(baking.plan(BakeRequest([path], tmp_path / "once", **OPTIONS)), 0).state == "skipped"
 
 
 def test_a_read_only_target_fails_alone_and_reads_on(tmp_path, shell):

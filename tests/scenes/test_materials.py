@@ -21,6 +21,7 @@ from scenes import WHOLE, as_glb, document, uri, written
 from whitefurnace import integrate
 from whitefurnace.advice.needs import NEGLIGIBLE, TABLE, Needs, lobes, needs, read_shares, write_job
 from whitefurnace.baking import bake as baking
+from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import jobs as batch
 from whitefurnace.cli import cli, main
 from whitefurnace.engines.presets import ENGINES
@@ -317,7 +318,7 @@ def test_every_engine_decides_about_every_scene(tmp_path):
         for background in (False, True):
             found = needs(scene, engine, background=background)
             assert 0 < found.nbytes <= found.full_nbytes and found.seconds <= found.full_seconds
-            order = baking.order(["demo"], "x", for_=engine.name, **found.options)
+            order = baking.plan(BakeRequest(["demo"], "x", for_=engine.name, **found.options))
             assert order.chains == (found.chain,) and order.engines == (found.own,)
             assert ("skybox" in found.without) == (bool(engine.holding("skybox")) and not background)
 
@@ -462,7 +463,7 @@ def test_without_pygltflib_one_sentence_names_the_extra(tmp_path, monkeypatch, c
                                      {"only_levels": "1-2", "fit": "read"}])
 def test_what_cannot_be_left_out(options):
     with pytest.raises(UsageError):
-        baking.order(["demo"], "x", **options)
+        baking.plan(BakeRequest(["demo"], "x", **options))
 
 
 # ------------------------------------------------------------------------------------------------- broken files

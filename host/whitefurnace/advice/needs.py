@@ -419,7 +419,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def bakes(found: Needs, output: str) -> list[dict[str, Any]]:
-    """What is to be baked of each environment, as options of `baking.order` and its folder as `output`."""
+    """The bakes that each environment needs: options of a `BakeRequest`, and the folder as `output`."""
     if found.own is None:
         return []
     made = [{"output": output, **found.options}]

@@ -11,13 +11,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from whitefurnace.baking.outputs import Made, Target, targets
 from whitefurnace.baking.programs import Program, programs
-from whitefurnace.catalogue.choice import Chosen, chosen, is_number
+from whitefurnace.baking.request import BakeRequest
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
 from whitefurnace.engines.presets import Engine, engines, reduced
 from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError
 from whitefurnace.files import (
@@ -40,7 +41,7 @@ from whitefurnace.prefiltering.convolution import Level
 from whitefurnace.prefiltering.lighting import Filtered, Lighting, Want, light
 from whitefurnace.prefiltering.plan import LevelPlan, plan_chain
 from whitefurnace.prefiltering.reading import Reader, compared
-from whitefurnace.prefiltering.recipe import DFG_SIZE, IRRADIANCE_SIZE, TOLERANCE_RANGE, Chain, chain
+from whitefurnace.prefiltering.recipe import CERTIFIED, DFG_SIZE, IRRADIANCE_SIZE, TOLERANCE_RANGE, Chain, chain
 from whitefurnace.results import Integrated
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere.environments import Environment, check_options, environment, source_digest
@@ -48,6 +49,9 @@ from whitefurnace.sphere.grids import Shape
 from whitefurnace.sphere.suns import Sun, sun_mode, without_sun
 from whitefurnace.tables.split_sum import SplitSum, split_sum
 from whitefurnace.version import VERSION
+
+if TYPE_CHECKING:
+    from whitefurnace.baking.request import Source
 
 DEMO = "demo"
 DEMO_HEIGHT = 512
@@ -96,7 +100,7 @@ class Baked:
 
 
 @dataclass(frozen=True)
-class Order:
+class BakePlan:
     """A validated bake of several environments: engines, and the chain of each."""
 
     names: tuple[str, ...]
@@ -118,33 +122,32 @@ class Order:
         return self.chains[0]
 
 
-def order(sources: Sequence[Any], output: str | os.PathLike[str], *, for_: str = "raw", rotate: float = 0.0,
-          exposure: float = 0.0, nonfinite: str = "refuse", sun: str = "keep", force: bool = False,
-          as_read: bool = False, sh: str | None = None, without: str | Sequence[str] = (), table: int | None = None,
-          **options: Any) -> Order:
-    """A validated order; `options` are those of `recipe.chain`. Raises UsageError, UnsupportedError."""
-    if not sources:
+def plan(request: BakeRequest) -> BakePlan:
+    """Check every option of a request and find the chain of each engine. Raises UsageError, UnsupportedError."""
+    if not request.sources:
         raise UsageError("no environment was given")
-    names = [name_of(item) for item in sources]
+    names = [name_of(item) for item in request.sources]
     seen: set[str] = set()
     for name in names:
         if name in seen:
             raise UsageError(f"two inputs are named {name!r}: their outputs would be the same files")
         seen.add(name)
-    check_options(rotate, exposure, nonfinite)
-    sun_mode(sun)
-    if options.get("samples") and any(e.octahedral for e in engines(for_)):
+    check_options(request.rotate, request.exposure, request.nonfinite)
+    sun_mode(request.sun)
+    if request.samples and any(e.octahedral for e in engines(request.for_)):
         raise UnsupportedError("samples are not drawn for octahedral maps; give a tolerance")
-    if options.get("certify") == 0:
+    if request.certify == 0:
         raise UsageError("certify 0: what is written states its error; give 299 or more texels")
-    window = "auto" if sh is None else harmonic.sh_window(sh)
+    window = "auto" if request.sh is None else harmonic.sh_window(request.sh)
+    without = request.without
     left_out = list(filter(None, map(str.strip, without.split(",")))) if isinstance(without, str) else list(without)
-    found = engines(for_)
-    if left_out or table is not None:
-        found = tuple(reduced(e, left_out, table) for e in found)
-    return Order(tuple(names), tuple(sources), Path(output), found, tuple(_chain(e, options) for e in found),
-                 float(rotate), float(exposure), nonfinite, sun, force, bool(as_read) or options.get("fit") is not None,
-                 window)
+    found = engines(request.for_)
+    if left_out or request.table is not None:
+        found = tuple(reduced(e, left_out, request.table) for e in found)
+    return BakePlan(tuple(names), tuple(request.sources), Path(request.output), found,
+                    tuple(_chain(e, request) for e in found), float(request.rotate), float(request.exposure),
+                    request.nonfinite, request.sun, request.force, bool(request.as_read) or request.fit is not None,
+                    window)
 
 
 def name_of(item: Any) -> str:
@@ -163,23 +166,24 @@ def name_of(item: Any) -> str:
     return name
 
 
-def _chain(engine: Engine, options: Mapping[str, Any]) -> Chain:
+def _chain(engine: Engine, request: BakeRequest) -> Chain:
     """The chain of an engine: its own mapping, and its sizes where none are given."""
-    given = {name: value for name, value in options.items() if value is not None}
-    for name in ("min_size", "levels"):
-        if engine.whole and name in given:
-            raise UsageError(f"{engine.name} needs all levels down to 1²: {name.replace('_', '-')} cannot be given")
-    if "only_levels" in given and engine.container == "files":
+    if engine.whole:
+        for name in ("min_size", "levels"):
+            if getattr(request, name) is not None:
+                raise UsageError(f"{engine.name} needs all levels down to 1²: {name.replace('_', '-')} cannot be given")
+    if request.only_levels is not None and engine.container == "files":
         raise UsageError(f"{engine.name} has all levels as mips of one texture: only-levels is of raw and exr")
-    given.setdefault("size", engine.size)
-    usual = engine.min_size
-    if engine.container == "files" and is_number(given["size"]) and given["size"] >= 1:
+    size, levels, usual = request.size if request.size is not None else engine.size, request.levels, engine.min_size
+    if engine.container == "files" and is_number(size) and size >= 1:
         # A small probe has the levels that it can have.
-        usual = min(usual, given["size"])
-        if engine.levels and not {"min_size", "levels"} & set(given):
-            given["levels"] = min(engine.levels, int(given["size"]).bit_length())
+        usual = min(usual, size)
+        if engine.levels and request.min_size is None and levels is None:
+            levels = min(engine.levels, int(size).bit_length())
     try:
-        return chain(lods=engine.lods, usual_min=usual, **given)
+        return chain(ndf=request.ndf, size=size, min_size=request.min_size, tolerance=request.tolerance,
+                     quality=request.quality, levels=levels, fit=request.fit, samples=request.samples,
+                     certify=request.certify, lods=engine.lods, usual_min=usual, only_levels=request.only_levels)
     except UsageError as error:
         raise error if engine.container != "files" else UsageError(f"{engine.name}: {error}") from None
 
@@ -189,29 +193,48 @@ def _is_demo(item: Any) -> bool:
     return str(item) == DEMO and not os.path.exists(item)
 
 
-def bake(sources: Any, output: str | os.PathLike[str], *, device: Device | str | None = None,
-         dry_run: bool = False, progress: Callable[[str, str, float], None] | None = None,
-         **options: Any) -> list[Baked]:
-    """Bakes environments (a path, an array, an `environment`, or a list of them; `demo` is built in) into `output`.
+def bake(sources: Source | Sequence[Source], output: str | os.PathLike[str], *, for_: str = "raw",
+         size: int | None = None, min_size: int | None = None, levels: int | None = None,
+         only_levels: str | None = None, without: str | Sequence[str] = (), table: int | None = None,
+         ndf: Spec = "ggx", tolerance: float | None = None, quality: str | None = None, samples: int | None = None,
+         certify: int = CERTIFIED, fit: str | None = None, as_read: bool = False, rotate: float = 0.0,
+         exposure: float = 0.0, nonfinite: str = "refuse", sun: str = "keep", sh: str | None = None,
+         force: bool = False, device: Device | str | None = None, dry_run: bool = False,
+         progress: Callable[[str, str, float], None] | None = None) -> list[Baked]:
+    """Bake environments into the files that engines load, each with its stated error.
 
-    options: for_ ("raw,exr"), size, min_size, ndf, tolerance, quality or samples, rotate (degrees), exposure (stops),
-    nonfinite ("refuse", "zero"), sun ("keep", "extract", "clamp=X"), sh ("window=auto", "window=none", "window=X": of
-    engines' irradiance harmonics), without (what of engines' files no material reads, as "irradiance,sh"), table
-    (texels a side of their split-sum tables), certify (texels of each level's statement), levels, fit ("read"),
-    as_read (measures what an engine will show, as fit "read" does too and a plan always), force.
-    Files go to `output/ENGINE/STEM…`; `output/STEM.json`, written last, proves the rest whole. An environment whose
-    manifest has the same key is skipped.
+    sources: a path, an array, an `environment`, or a list of them; the word `demo` is the built-in sky.
+    output: the folder of all files. They go to `output/ENGINE/STEM…`; the manifest `output/STEM.json` is written last
+        and proves the rest whole. An environment whose manifest has the same key is skipped.
+    for_: target engines or .toml files of your own, separated by commas.
+    size, min_size: texels a face edge of the first and last level, powers of two from 1 to 2048. levels: their number,
+        1 to 32. only_levels: "A-B", the levels that are made for raw and exr, counted from 0.
+    without: parts of engines' files to leave out, of irradiance, sh, sheen, dfg, skybox. table: texels a side of
+        engines' split-sum tables.
+    ndf: an isotropic NDF, by name, path of a .clh file or entry.
+    tolerance: bound on the stated error of every level, 1e-5 to .5, 1e-3 by default; or quality "draft" (1e-2),
+        "normal" (1e-3), "reference" (2e-5); or samples, 1 to 65536, for filtered importance sampling.
+    certify: texels of each level whose error is measured, 299 to 1048576.
+    fit: "read" fits the levels to how they are interpolated. as_read: measure the error after the engine's sampling.
+    rotate: degrees about +Y. exposure: stops. nonfinite: "refuse" or "zero". sun: "keep", "extract" or "clamp=X".
+    sh: "window=auto", "window=none" or "window=X", the window of engines' irradiance harmonics.
+    force: bake again, and replace files that are not known to be ours.
+    device: a `Device`, or a number or part of a name. dry_run: say what would be done, and do nothing.
+    progress: called with the environment's name, the part that is made and the share done.
     Raises UsageError, FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an
     environment that fails.
     """
-    single = isinstance(sources, (str, os.PathLike, np.ndarray, Environment))
-    request = order([sources] if single else list(sources), output, **options)
-    return [bake_one(request, k, device, dry_run=dry_run, progress=progress) for k in range(len(request.names))]
+    several: Sequence[Source] = (
+        [sources] if isinstance(sources, (str, os.PathLike, np.ndarray, Environment)) else list(sources))
+    asked = BakeRequest(several, output, for_, size, min_size, levels, only_levels, without, table, ndf, tolerance,
+                        quality, samples, certify, fit, as_read, rotate, exposure, nonfinite, sun, sh, force)
+    planned = plan(asked)
+    return [bake_one(planned, k, device, dry_run=dry_run, progress=progress) for k in range(len(planned.names))]
 
 
-def bake_one(request: Order, k: int, device: Device | str | None = None, *, dry_run: bool = False,
+def bake_one(request: BakePlan, k: int, device: Device | str | None = None, *, dry_run: bool = False,
              progress: Callable[[str, str, float], None] | None = None) -> Baked:
-    """The k-th environment of an order."""
+    """Bake the k-th environment of a plan."""
     found = read(request, k, device, dry_run=dry_run)
     if isinstance(found, Baked):
         return found
@@ -227,7 +250,7 @@ class Loaded:
     """An environment that was read and is to be baked. It holds the lock of its output until `write` or `abandon`;
     `there` is the manifest that is replaced, `made` the folders that were made for it."""
 
-    request: Order
+    request: BakePlan
     k: int
     env: Environment
     sun: Sun | None
@@ -263,7 +286,7 @@ class Computed:
 
 
 @contextlib.contextmanager
-def _system_errors(request: Order) -> Iterator[None]:
+def _system_errors(request: BakePlan) -> Iterator[None]:
     """What the system says of a path in passing, as FileError."""
     try:
         yield
@@ -271,12 +294,12 @@ def _system_errors(request: Order) -> Iterator[None]:
         raise FileError(f"cannot use {error.filename or request.output}: {error.strerror or error}") from error
 
 
-def manifest_path(request: Order, k: int) -> Path:
+def manifest_path(request: BakePlan, k: int) -> Path:
     """Where the manifest of the k-th environment is."""
     return request.output / f"{request.names[k]}.json"
 
 
-def status(request: Order, k: int) -> Baked:
+def status(request: BakePlan, k: int) -> Baked:
     """Whether the k-th environment is up to date (`skipped`) or would be baked (`planned`, without a plan), from the
     bytes of its source and outputs: nothing is decoded. Raises FileError for what cannot be read or is not ours."""
     with _system_errors(request):
@@ -290,7 +313,7 @@ def status(request: Order, k: int) -> Baked:
         return Baked(name, "planned", tuple(t.path for t in written), {}, (), tuple(t.nbytes for t in written), ())
 
 
-def _up_to_date(request: Order, k: int, there: dict[str, Any] | None, begin: float) -> Baked | None:
+def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: float) -> Baked | None:
     """The item as its manifest tells it, where that proves it whole and has the key of these source bytes: a skip costs
     reading them, not decoding them."""
     item, told = request.sources[k], (there or {}).get("source")
@@ -311,8 +334,8 @@ def _up_to_date(request: Order, k: int, there: dict[str, Any] | None, begin: flo
                  time.perf_counter() - begin)
 
 
-def read(request: Order, k: int, device: Device | str | None = None, *, dry_run: bool = False) -> Baked | Loaded:
-    """Reads the k-th environment of an order and takes the lock of its output, waiting where another run has it. A
+def read(request: BakePlan, k: int, device: Device | str | None = None, *, dry_run: bool = False) -> Baked | Loaded:
+    """Reads the k-th environment of a plan and takes the lock of its output, waiting where another run has it. A
     Baked where there is nothing to do, or where `dry_run` asks what would be done. No device but for `demo` and a plan.
     Raises FileError, InputError."""
     with _system_errors(request):
@@ -383,7 +406,7 @@ def _engines_of(manifest: Mapping[str, Any]) -> list[str]:
     return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
 
 
-def _read(request: Order, k: int, device: Device | str | None, lock: Lock | None, made: tuple[Path, ...],
+def _read(request: BakePlan, k: int, device: Device | str | None, lock: Lock | None, made: tuple[Path, ...],
           there: dict[str, Any] | None, begin: float) -> Baked | Loaded:
     name, item, path = request.names[k], request.sources[k], manifest_path(request, k)
     on: Device | None = device if isinstance(device, Device) else None
@@ -507,13 +530,13 @@ def _write(made: Computed) -> Baked:
                  time.perf_counter() - loaded.begin, tuple(manifest.get("as_read", ())))
 
 
-def targets_of(request: Order, name: str) -> list[Target]:
+def targets_of(request: BakePlan, name: str) -> list[Target]:
     """The files of every engine, for an environment of that name."""
     return [target for engine, recipe in zip(request.engines, request.chains, strict=True)
             for target in targets(engine, recipe, request.output, name)]
 
 
-def _wanted(request: Order) -> tuple[list[Want], list[tuple[int, int]]]:
+def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
     """The chains to make, equal ones once, and for each engine the places of its own and of Charlie's in them."""
     def most(a: int | None, b: int | None) -> int | None:
         return None if a is None or b is None else max(a, b)  # None: all
@@ -541,7 +564,7 @@ def _wanted(request: Order) -> tuple[list[Want], list[tuple[int, int]]]:
     return wants, of
 
 
-def _rows_of(request: Order, lit: Lighting, of: Sequence[tuple[int, int]],
+def _rows_of(request: BakePlan, lit: Lighting, of: Sequence[tuple[int, int]],
              what: str) -> list[tuple[Level, float | None, str, tuple[str, ...]]]:
     """Each distinct level of `what` (a field of Filtered), what of the energy it keeps (of levels alone), its NDF and
     the engines it is for."""
@@ -567,7 +590,7 @@ def _rows_of(request: Order, lit: Lighting, of: Sequence[tuple[int, int]],
     return sorted(found.values(), key=lambda row: (row[2] == "charlie", -row[0].texels.shape[-2], row[0].roughness))
 
 
-def _programs(request: Order, env: Environment) -> tuple[Program, ...]:
+def _programs(request: BakePlan, env: Environment) -> tuple[Program, ...]:
     """The kernel programs of a bake."""
     wants, _ = _wanted(request)
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
@@ -577,7 +600,7 @@ def _programs(request: Order, env: Environment) -> tuple[Program, ...]:
     return programs(chains or [wants[0].recipe], env.kind, texel, demo=env.name == DEMO, charlie=charlie)
 
 
-def planned_levels(request: Order, texel: float) -> tuple[tuple[tuple[str, ...], LevelPlan], ...]:
+def planned_levels(request: BakePlan, texel: float) -> tuple[tuple[tuple[str, ...], LevelPlan], ...]:
     """Each distinct level of the engines' chains, with their names."""
     rows: list[tuple[list[str], LevelPlan]] = []
     for engine, recipe in zip(request.engines, request.chains, strict=True):
@@ -593,7 +616,7 @@ def planned_levels(request: Order, texel: float) -> tuple[tuple[tuple[str, ...],
     return tuple((tuple(sorted(names)), level) for names, level in rows)
 
 
-def _as_read(request: Order, on: Device, env: Environment, lit: Lighting, of: Sequence[tuple[int, int]],
+def _as_read(request: BakePlan, on: Device, env: Environment, lit: Lighting, of: Sequence[tuple[int, int]],
              written: Sequence[Target]) -> list[dict[str, Any]]:
     """What each engine shows of its chain, in its mapping and from its format."""
     rows: list[dict[str, Any]] = []
@@ -633,7 +656,7 @@ def format_notices(manifest: Mapping[str, Any]) -> list[str]:
     return found
 
 
-def _would_read(request: Order, env: Environment, device: Device | str | None,
+def _would_read(request: BakePlan, env: Environment, device: Device | str | None,
                 on: Device | None) -> tuple[tuple[dict[str, Any], ...], tuple[str, ...]]:
     """What engines would show of the planned chain and of others, and notices: a plan needs no device for the rest."""
     try:
@@ -673,7 +696,7 @@ def _entries(manifest: dict[str, Any]) -> dict[str, Any]:
     return {**manifest.get("kept", {}), **manifest["files"]}
 
 
-def _canonical(request: Order, rotation: float, exposure: float) -> dict[str, Any]:
+def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str, Any]:
     """The recipe as data: everything that changes the bytes, and nothing else."""
     own = {e.name: {"engine": e.data(), "chain": c.canonical()}
            for e, c in zip(request.engines, request.chains, strict=True) if e.container == "files" or e.without}
@@ -740,7 +763,7 @@ def _whole(manifest: dict[str, Any], output: Path) -> bool:
     return True
 
 
-def _check_ownership(paths: Sequence[Path], known: Sequence[dict[str, Any]], request: Order, manifest: Path) -> None:
+def _check_ownership(paths: Sequence[Path], known: Sequence[dict[str, Any]], request: BakePlan, manifest: Path) -> None:
     """Refuses to replace what no manifest of ours proves to be ours for this item. Raises FileError."""
     if request.force:
         return
@@ -773,7 +796,7 @@ def _check_writable(output: Path, name: str) -> None:
         raise FileError(f"cannot write into {output}: {error.strerror or error}") from error
 
 
-def _manifest(request: Order, name: str, env: Environment, sun: Sun | None, recipe: dict[str, Any], key: str,
+def _manifest(request: BakePlan, name: str, env: Environment, sun: Sun | None, recipe: dict[str, Any], key: str,
               device: Device, lit: Lighting, of: Sequence[tuple[int, int]], table: Integrated,
               window: harmonic.Windowed) -> dict[str, Any]:
     def row(level: Level, kept: float | None = None, ndf: str | None = None,

@@ -20,6 +20,7 @@ import msgspec
 import tomllib
 
 from whitefurnace.baking import bake as baking
+from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import pool
 from whitefurnace.catalogue.choice import file_of
 from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, nearest
@@ -350,7 +351,7 @@ class _Maker:
         options["for_"] = ",".join(files or ["raw"])
         try:
             recipe = _recipe(options)
-            order = _bake_order(recipe, str(output), self.force)
+            order = _bake_plan(recipe, str(output), self.force)
         except WhitefurnaceError as error:
             self.say(place, error)
             return
@@ -542,10 +543,10 @@ def _recipe(options: dict[str, Any]) -> str:
 
 
 @lru_cache(maxsize=64)
-def _bake_order(recipe: str, output: str, force: bool) -> baking.Order:
-    """The order of a table, of no environment yet."""
+def _bake_plan(recipe: str, output: str, force: bool) -> baking.BakePlan:
+    """The plan of a [[bake]], of no environment yet."""
     options = json.loads(recipe)["options"]
-    return baking.order(["environment"], output, force=force, **options)
+    return baking.plan(BakeRequest(["environment"], output, force=force, **options))
 
 
 def _table_plan(recipe: str, kind: str, output: str, force: bool) -> tables.TablePlan:
@@ -664,9 +665,9 @@ def do(item: Item) -> Result:
     return found
 
 
-def _one(item: Item, source: str | None = None) -> baking.Order:
+def _one(item: Item, source: str | None = None) -> baking.BakePlan:
     """The order of an item alone."""
-    return replace(_bake_order(item.recipe, item.output, item.force), names=(item.name,),
+    return replace(_bake_plan(item.recipe, item.output, item.force), names=(item.name,),
                    sources=(source or item.source,))
 
 
@@ -709,7 +710,7 @@ def _source(item: Item) -> Iterator[str]:
 def _check_inside(item: Item) -> None:
     """Refuses folders that a link leads out of the root: it may have been put there since the job was checked."""
     folders = {Path(item.output).parent} if item.kind == "lut" else {Path(item.output), *(
-        t.path.parent for t in baking.targets_of(_bake_order(item.recipe, item.output, item.force), _STEM))}
+        t.path.parent for t in baking.targets_of(_bake_plan(item.recipe, item.output, item.force), _STEM))}
     for folder in sorted(folders):
         if not _below(item.root, os.path.realpath(folder)):
             raise FileError(f"{folder} leads out of {item.root}: outputs stay below it; give -o where that is meant")

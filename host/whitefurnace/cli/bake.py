@@ -92,28 +92,29 @@ def bake(environments: tuple[str, ...], output: Path, for_: str, size: int | Non
     ny, pz, nz), a texture (.ktx, .ktx2, .dds, .env, .gltf), or the word demo for the built-in sky.
     """
     from whitefurnace.baking import bake as baking
+    from whitefurnace.baking.request import BakeRequest
 
-    request = baking.order(
+    planned = baking.plan(BakeRequest(
         environments, output, for_=for_, size=size, min_size=min_size, levels=levels, only_levels=only_levels,
         without=without, table=table, ndf=ndf, tolerance=tolerance, quality=quality, samples=samples, certify=certify,
-        fit=fit, as_read=as_read, rotate=rotate, exposure=exposure, nonfinite=nonfinite, sun=sun, sh=sh, force=force)
+        fit=fit, as_read=as_read, rotate=rotate, exposure=exposure, nonfinite=nonfinite, sun=sun, sh=sh, force=force))
     failures: list[WhitefurnaceError] = []
     with progress(not (quiet or as_json)) as report:
-        for k, name in enumerate(request.names):
+        for k, name in enumerate(planned.names):
             try:
-                baked = baking.bake_one(request, k, device, dry_run=dry_run, progress=report)
+                baked = baking.bake_one(planned, k, device, dry_run=dry_run, progress=report)
             except WhitefurnaceError as error:
                 failures.append(error)
-                if len(request.names) > 1:
+                if len(planned.names) > 1:
                     _print_failure(name, error, as_json)
             else:
                 print_baked(baked, output, as_json, quiet)
-    if len(request.names) == 1 and failures:
+    if len(planned.names) == 1 and failures:
         raise failures[0]
     if failures:
-        alike = len({type(error) for error in failures}) == 1 and len(failures) == len(request.names)
+        alike = len({type(error) for error in failures}) == 1 and len(failures) == len(planned.names)
         raise (type(failures[0]) if alike else PartialError)(
-            f"{len(failures)} of {len(request.names)} environments failed")
+            f"{len(failures)} of {len(planned.names)} environments failed")
 
 
 def _print_failure(name: str, error: WhitefurnaceError, as_json: bool) -> None:

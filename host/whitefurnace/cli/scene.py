@@ -165,13 +165,14 @@ def _bake(needs: Needs, for_: str, environments: tuple[str, ...], output: Path, 
     """Bake what a scene needs of every environment, with the options of `best` where some were chosen."""
     from whitefurnace.advice import needs as deciding
     from whitefurnace.baking import bake as baking
+    from whitefurnace.baking.request import BakeRequest
 
     requests = []
     for k, one in enumerate(deciding.bakes(needs, str(output))):
         folder = Path(one.pop("output"))
         for some in [(name,) for name in environments] if best and k == 0 else [environments]:
             own = best[some[0]] if best and k == 0 else one
-            requests.append((folder, baking.order(some, folder, for_=for_, force=force, **own)))
+            requests.append((folder, baking.plan(BakeRequest(some, folder, for_=for_, force=force, **own))))
     with progress(not (quiet or as_json)) as report:
         for folder, request in requests:
             for k in range(len(request.names)):

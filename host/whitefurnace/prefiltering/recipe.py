@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from whitefurnace.catalogue import Model
-from whitefurnace.catalogue.choice import Chosen, chosen, is_number
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
 from whitefurnace.errors import UnsupportedError, UsageError, nearest
 from whitefurnace.expression import Expression
 
@@ -226,7 +225,7 @@ def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = 
     return min_size
 
 
-def chain(*, ndf: str | Model = "ggx", size: int = 256, min_size: int | None = None, tolerance: float | None = None,
+def chain(*, ndf: Spec = "ggx", size: int = 256, min_size: int | None = None, tolerance: float | None = None,
           quality: str | None = None, levels: int | None = None, fit: str | None = None,
           samples: int | None = None, certify: int = CERTIFIED, lods: Lods | None = None,
           usual_min: int = MIN_SIZE, only_levels: str | None = None) -> Chain:

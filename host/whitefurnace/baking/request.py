@@ -1,0 +1,48 @@
+"""What a caller asks of a bake, before anything of it is checked."""
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from whitefurnace.prefiltering.recipe import CERTIFIED
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from whitefurnace.catalogue.choice import Spec
+    from whitefurnace.sphere.environments import Environment
+
+    Source = str | os.PathLike[str] | np.ndarray | Environment
+
+
+@dataclass(frozen=True)
+class BakeRequest:
+    """Every option of a bake, with its default; `whitefurnace.bake` says what each means.
+
+    `size`, `min_size`, `levels` and `table` are the engine's own where they are None.
+    """
+
+    sources: Sequence[Source]
+    output: str | os.PathLike[str]
+    for_: str = "raw"
+    size: int | None = None
+    min_size: int | None = None
+    levels: int | None = None
+    only_levels: str | None = None
+    without: str | Sequence[str] = ()
+    table: int | None = None
+    ndf: Spec = "ggx"
+    tolerance: float | None = None
+    quality: str | None = None
+    samples: int | None = None
+    certify: int = CERTIFIED
+    fit: str | None = None
+    as_read: bool = False
+    rotate: float = 0.0
+    exposure: float = 0.0
+    nonfinite: str = "refuse"
+    sun: str = "keep"
+    sh: str | None = None
+    force: bool = False
