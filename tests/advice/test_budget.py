@@ -14,7 +14,8 @@ import pytest
 
 from scenes import document
 from whitefurnace import integrate
-from whitefurnace.advice.budget import ACCURACY, Meter, of_image, sampled, usual
+from whitefurnace.advice.budget import ErrorMeter, choose, of_image, sample_points, usual
+from whitefurnace.advice.reference import ACCURACY
 from whitefurnace.baking import bake as baking
 from whitefurnace.baking.request import BakeRequest
 from whitefurnace.catalogue import model
@@ -76,8 +77,8 @@ def directions(texels: np.ndarray) -> np.ndarray:
 def test_constant_light_leaves_only_the_model(device, tmp_path):
     """Every mean of constant light is that light: what the files and the split sum add is rounding. b10g11r11 and half
     floats hold 1 exactly; float32 sums of some 10⁴ terms keep 1e-5."""
-    meter = Meter(scene_of(tmp_path, *MIXED), environment(np.ones((16, 32, 3), np.float32)), ENGINES["filament"],
-                  device, count=COUNT)
+    meter = ErrorMeter(scene_of(tmp_path, *MIXED), environment(np.ones((16, 32, 3), np.float32)), ENGINES["filament"],
+                       device, count=COUNT)
     found = meter.budget(chain(size=32, min_size=8))
     for name in ("texels", "roughness", "format", "diffuse", "n = v = r", "F·G from L", "split sum"):
         assert found[name].rms < 2e-5, (name, found[name])
@@ -89,7 +90,7 @@ def test_constant_light_leaves_only_the_model(device, tmp_path):
 
 def test_a_mirror_has_texels_alone(device, tmp_path):
     env = lobed()
-    meter = Meter(scene_of(tmp_path, plain(WHITE, 1, 0)), env, ENGINES["raw"], device, count=COUNT)
+    meter = ErrorMeter(scene_of(tmp_path, plain(WHITE, 1, 0)), env, ENGINES["raw"], device, count=COUNT)
     found = meter.budget(chain(size=64))
     for name in ("diffuse", "roughness", "format", "n = v = r", "F·G from L", "split sum", "Fresnel", "energy"):
         assert found[name].rms < 1e-6, (name, found[name])
@@ -108,7 +109,7 @@ def test_a_rough_metal_in_linear_light(device, tmp_path):
     a = np.array([[0.5, 0.2, -0.4], [0.1, -0.6, 0.3], [-0.3, 0.3, 0.5]])  # a row a channel
     texels = np.zeros((128, 256, 3), np.float32)
     texels[:] = 1 + directions(texels) @ a.T
-    meter = Meter(scene_of(tmp_path, plain(WHITE, 1, 1)), environment(texels), ENGINES["raw"], device, count=COUNT)
+    meter = ErrorMeter(scene_of(tmp_path, plain(WHITE, 1, 1)), environment(texels), ENGINES["raw"], device, count=COUNT)
     p = meter.points
     c = p.NoV
     q = np.log((1 + c) / c)
@@ -116,9 +117,9 @@ def test_a_rough_metal_in_linear_light(device, tmp_path):
     levels, own_view = 1 + 2 / 3 * (a @ mirror).T, 1 + 2 / 3 * (a @ p.n).T
     E = (1 - c * q)[:, None]
     seen = 1 + ((0.5 - c + c * c * q) / (1 - c * q))[:, None] * (a @ p.n).T
-    for got, want in ((meter.prefiltered, levels), (meter.own_view, own_view), (meter.right, seen)):
+    for got, want in ((meter.reads.prefiltered, levels), (meter.integrals.own_view, own_view), (meter.right, seen)):
         assert np.quantile(np.abs(got / want - 1), 0.95) < ACCURACY, np.abs(got / want - 1).max()
-    assert np.allclose(meter.exact_table[0] + meter.exact_table[1], E[:, 0], atol=2e-5)
+    assert np.allclose(meter.integrals.exact_table[0] + meter.integrals.exact_table[1], E[:, 0], atol=2e-5)
     # raw gives nothing back: the split sum weighs by E, what is right has the mean itself
     for name, difference in (("n = v = r", E * (levels - own_view)), ("F·G from L", E * (own_view - seen)),
                              ("split sum", E * (levels - seen)), ("energy", (E - 1) * seen)):
@@ -134,8 +135,8 @@ def test_a_mixed_material_in_linear_light(device, tmp_path):
     a, metal, color = np.array([0.5, -0.4, 0.3]), 0.25, np.array([0.9, 0.5, 0.1])
     texels = np.zeros((128, 256, 3), np.float32)
     texels[:] = (1 + directions(texels) @ a)[..., None]
-    meter = Meter(scene_of(tmp_path, plain((0.9, 0.5, 0.1), metal, 1)), environment(texels), ENGINES["raw"], device,
-                  count=48)
+    scene = scene_of(tmp_path, plain((0.9, 0.5, 0.1), metal, 1))
+    meter = ErrorMeter(scene, environment(texels), ENGINES["raw"], device, count=48)
     p = meter.points
     c = p.NoV[:, None, None]
     x, w = np.polynomial.legendre.leggauss(96)
@@ -159,8 +160,8 @@ def test_fresnel_against_a_quadrature(device, tmp_path):
     """A black insulator of α = 1 in constant light shows its albedo: ∫ F(v·h) (n·l)/(2π (n·l + n·v)) dω, by nodes of
     Gauss in n·l and equal ones in azimuth, with the catalogue's float64 Fresnel terms."""
     ior = 2.2
-    meter = Meter(scene_of(tmp_path, plain((0, 0, 0), 0, 1, ior={"ior": ior})),
-                  environment(np.ones((16, 32, 3), np.float32)), ENGINES["filament"], device, count=48)
+    meter = ErrorMeter(scene_of(tmp_path, plain((0, 0, 0), 0, 1, ior={"ior": ior})),
+                       environment(np.ones((16, 32, 3), np.float32)), ENGINES["filament"], device, count=48)
     x, w = np.polynomial.legendre.leggauss(96)
     mu, w = (x + 1) / 2, w / 2
     phi = (np.arange(96) + 0.5) / 96 * math.pi
@@ -183,27 +184,27 @@ def test_other_ways_in_constant_light(device, tmp_path):
     """White metal of α = 1 shows 1; without masking its albedo is ∫ (n·l)/(4π) dω = ¼ in place of 1 - c q. Oren and
     Nayar's diffuse, put together of two albedos, is what the quadrature of this very colour gives."""
     env = environment(np.ones((16, 32, 3), np.float32))
-    rough = Meter(scene_of(tmp_path, plain(WHITE, 1, 1)), env, ENGINES["raw"], device, count=48)
+    rough = ErrorMeter(scene_of(tmp_path, plain(WHITE, 1, 1)), env, ENGINES["raw"], device, count=48)
     c = rough.points.NoV
     once = 1 - c * np.log((1 + c) / c)
     assert np.allclose(rough.right, 1, rtol=1e-5)
-    assert np.allclose(rough.masked("implicit"), (0.25 - once)[:, None], atol=1e-4)
-    assert np.allclose(rough.reference(again=False), once[:, None], atol=1e-4)
-    assert not rough.grooved().any()  # metal has no diffuse
+    assert np.allclose(rough.integrals.masked("implicit"), (0.25 - once)[:, None], atol=1e-4)
+    assert np.allclose(rough.integrals.reference(again=False), once[:, None], atol=1e-4)
+    assert not rough.integrals.grooved().any()  # metal has no diffuse
     color, r = (0.8, 0.5, 0.2), 0.7
-    matte = Meter(scene_of(tmp_path, plain(color, 0, r)), env, ENGINES["raw"], device, count=48)
+    matte = ErrorMeter(scene_of(tmp_path, plain(color, 0, r)), env, ENGINES["raw"], device, count=48)
     want = integrate("albedo", diffuse="oren_nayar", NoV=matte.points.NoV[:, None], albedo=np.array(color),
                      sigma=math.atan(r * r / math.sqrt(2))).values - np.array(color)
-    rest = 1 - matte.reflected(matte.sampled.f0)[1]
-    assert np.allclose(matte.grooved(), rest * want, atol=2e-4)
+    rest = 1 - matte.integrals.reflected(matte.sampled.f0)[1]
+    assert np.allclose(matte.integrals.grooved(), rest * want, atol=2e-4)
 
 
 def test_lobes_are_those_of_the_prefilter(meter, device):
     """By sums over all texels (`reading.Exact`), which share no code with the samples here."""
     exact = Exact(device, meter.env, usual(ENGINES["filament"]))
-    for g in meter.groups:
-        want = exact.lobes([(single(g.roughness), meter.looked_up[:, g.index])])[0]
-        assert np.quantile(texel_errors(meter.prefiltered[g.index], want, exact.mean), 0.95) < ACCURACY
+    for g in meter.integrals.groups:
+        want = exact.lobes([(single(g.roughness), meter.reads.looked_up[:, g.index])])[0]
+        assert np.quantile(texel_errors(meter.reads.prefiltered[g.index], want, exact.mean), 0.95) < ACCURACY
 
 
 # ------------------------------------------------------------------------------------------------- the engine's picture
@@ -218,7 +219,7 @@ def test_the_picture_is_that_of_the_files(name, device, tmp_path):
     scene = scene_of(tmp_path, *MIXED, plain((0.1, 0.1, 0.1), 0, 0.2, ior={"ior": 2.0}))
     baking.bake(tmp_path / "sky.exr", tmp_path / "out", for_=name, size=32, device=device)
     lights = rendering.read_lights(engine, tmp_path / "out" / name, "sky")
-    meter = Meter(scene, environment(tmp_path / "sky.exr"), engine, device, count=COUNT)
+    meter = ErrorMeter(scene, environment(tmp_path / "sky.exr"), engine, device, count=COUNT)
     made = meter.budget(usual(engine, size=32))
     s = meter.sampled
     X = rendering.shade(engine, lights, s.points.n, s.points.v, s.color, s.metal, s.roughness, s.f0)
@@ -226,7 +227,7 @@ def test_the_picture_is_that_of_the_files(name, device, tmp_path):
     # another seed of the certificate may refine a level: 1e-3 is its tolerance
     assert made.whole.rms == pytest.approx(float(np.sqrt((off * off).mean())), rel=2e-3, abs=1e-5)
     assert made.whole.p95 == pytest.approx(float(np.quantile(off, 0.95)), rel=2e-3, abs=1e-5)
-    choice = meter.choose(0.5, usual(engine))
+    choice = choose(meter, 0.5, usual(engine))
     assert choice.met and choice.nbytes < choice.usual_nbytes
 
 
@@ -234,8 +235,9 @@ def test_the_picture_is_that_of_the_files(name, device, tmp_path):
 
 
 @pytest.fixture(scope="session")
-def meter(device, tmp_path_factory) -> Meter:
-    return Meter(scene_of(tmp_path_factory.mktemp("mixed"), *MIXED), lobed(), ENGINES["filament"], device, count=COUNT)
+def meter(device, tmp_path_factory) -> ErrorMeter:
+    scene = scene_of(tmp_path_factory.mktemp("mixed"), *MIXED)
+    return ErrorMeter(scene, lobed(), ENGINES["filament"], device, count=COUNT)
 
 
 def test_a_worse_cause_has_a_larger_effect(meter):
@@ -266,7 +268,7 @@ def test_the_filter_is_bounded_by_its_tolerance(meter):
 
 
 def test_the_choice_is_within_and_no_dearer_when_looser(meter, tmp_path):
-    made = [meter.choose(x, usual(ENGINES["filament"])) for x in (0.3, 0.1, 0.03)]
+    made = [choose(meter, x, usual(ENGINES["filament"])) for x in (0.3, 0.1, 0.03)]
     for one in made:
         assert one.met and one.error <= one.tolerance, one
         own = dict(one.options)
@@ -286,23 +288,23 @@ def test_raw_may_have_harmonics(device, tmp_path):
     """Light of degree 1 is exactly in nine harmonics: they are cheaper than a cube."""
     texels = np.zeros((64, 128, 3), np.float32)
     texels[:] = (1 + directions(texels) @ [0.3, 0.5, 0.2])[..., None]
-    meter = Meter(scene_of(tmp_path, plain((0.8, 0.8, 0.8), 0, 0.9)), environment(texels), ENGINES["raw"], device,
-                  count=COUNT)
-    choice = meter.choose(0.05, usual(ENGINES["raw"]))
+    meter = ErrorMeter(scene_of(tmp_path, plain((0.8, 0.8, 0.8), 0, 0.9)), environment(texels), ENGINES["raw"], device,
+                       count=COUNT)
+    choice = choose(meter, 0.05, usual(ENGINES["raw"]))
     assert choice.met and choice.options["without"] == ["irradiance"]
     # of an engine without harmonics there is no such choice
-    left = Meter(meter.scene, meter.env, ENGINES["raw"], device, without=["sh"], count=16)
-    assert left.choose(0.5, usual(ENGINES["raw"])).options["without"] == ["sh"]
+    left = ErrorMeter(meter.scene, meter.env, ENGINES["raw"], device, without=["sh"], count=16)
+    assert choose(left, 0.5, usual(ENGINES["raw"])).options["without"] == ["sh"]
     assert meter.budget(usual(ENGINES["raw"]))["diffuse by harmonics"].rms < 1e-3
 
 
 def test_what_cannot_be_measured_is_said(device, meter, tmp_path):
     with pytest.raises(UsageError, match="outside"):
-        meter.choose(0.0, usual(ENGINES["filament"]))
+        choose(meter, 0.0, usual(ENGINES["filament"]))
     with pytest.raises(UnsupportedError, match="godot filters the image itself"):
-        Meter(meter.scene, meter.env, ENGINES["godot"], device)
+        ErrorMeter(meter.scene, meter.env, ENGINES["godot"], device)
     with pytest.raises(InputError, match="no materials that light falls on"):
-        sampled(scene_of(tmp_path, {"extensions": {"KHR_materials_unlit": {}}}))
+        sample_points(scene_of(tmp_path, {"extensions": {"KHR_materials_unlit": {}}}))
 
 
 # ------------------------------------------------------------------------------------------------- points
@@ -313,7 +315,7 @@ def test_points_are_distributed_as_the_materials(tmp_path):
     image[:, :2, 1], image[:, 2:, 1] = 51, 204  # a quarter at r = .2, the rest at .8
     image[:4, :, 2] = 255
     textured = {"pbrMetallicRoughness": {"metallicRoughnessTexture": {"index": 0}}}
-    found = sampled(scene_of(tmp_path, textured, plain(WHITE, 0, 0.5), images=[image]), count=400)
+    found = sample_points(scene_of(tmp_path, textured, plain(WHITE, 0, 0.5), images=[image]), count=400)
     own = found.material == 0
     assert own.sum() == 200
     assert np.mean(found.roughness[own] < 0.5) == pytest.approx(0.25, abs=0.01)
@@ -323,7 +325,7 @@ def test_points_are_distributed_as_the_materials(tmp_path):
     assert np.abs(found.roughness[own] - np.where(found.roughness[own] < 0.5, 0.2, 0.8)).max() <= 1 / 64
     NoV = (found.points.n * found.points.v).sum(0)
     assert np.mean(NoV**2) == pytest.approx(0.5, abs=0.01)  # of density 2 n·v
-    again = sampled(scene_of(tmp_path, textured, plain(WHITE, 0, 0.5), images=[image]), count=400)
+    again = sample_points(scene_of(tmp_path, textured, plain(WHITE, 0, 0.5), images=[image]), count=400)
     assert np.array_equal(found.roughness, again.roughness) and np.array_equal(found.points.n, again.points.n)
 
 
