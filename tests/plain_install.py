@@ -66,7 +66,6 @@ def main() -> int:
         print(f"This environment has {', '.join(present)}: it is no plain install and would prove nothing.")
         return 2
     import documents
-
     import public_calls
 
     failures = []
@@ -83,6 +82,8 @@ def main() -> int:
         documents.prepare(Path(folder))
         os.chdir(folder)
         for line in documents.commands():
+            if before := documents.needed(line):
+                check(f"(the bake of) {line.text}", complaint(before))
             check(line.text, complaint(documents.shortened(line), line.exit_codes))
         for block in documents.python_blocks():
             check(f"the Python of {block.page}", _called(lambda text=block.text: exec(text, {})))
