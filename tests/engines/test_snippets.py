@@ -5,7 +5,6 @@ were read, and the results are held against numbers written here by hand from wh
 """
 from __future__ import annotations
 
-import math
 import re
 import shutil
 import subprocess
@@ -13,7 +12,7 @@ import subprocess
 import numpy as np
 import pytest
 
-from whitefurnace.engines.presets import ENGINES, Dfg, Engine, File
+from whitefurnace.engines.presets import ENGINES, PRESETS, Dfg, Engine, File, Published
 from whitefurnace.engines.snippets import snippet
 from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.expression import LANGUAGES
@@ -33,34 +32,15 @@ ATLAS = Engine(name="atlas", lod="max_lod * r", file=(File("specular", "{stem}.e
 EDGES = Engine(name="edges", lod="max_lod * r", file=(File("specular", "{stem}.exr", layout="octahedral", border=0),))
 BAKED = [*(engine for engine in ENGINES.values() if engine.holding("specular")), OWN, MAPS, ATLAS, EDGES]
 
-MINIMUM_VARIANCE = 5e-4  # that Babylon.js adds to α
-# At r = 1/2 with the levels and width of each engine, from what is published of it: the lod, the share of the normal in
-# the direction, and how the stored direction is made of the world's. formats.md's table, and Bevy's listing 22 of
-# Lagarde and de Rousiers: 1 - (1 - α)(√(1 - α) + α) at α = 1/4.
-HALF = {
-    "filament": (5, 256, 0.75 * 4, 1 / 16, (1, 2, 3)),
-    "three": (6, 256, 0.75 * 5, 1 / 16, (-1, 2, 3)),
-    "babylon": (8, 128, 0.8 * math.log2(128 * (1 / 4 + MINIMUM_VARIANCE)), 0.0, (1, 2, -3)),
-    "bevy": (5, 256, 2.0, 1 - 0.75 * (0.8660254037844386 + 0.25), (1, 2, -3)),
-    "gltf": (5, 256, 2.0, 0.0, (1, 2, 3)),
-    "khronos": (5, 256, 2.0, 0.0, (1, 2, 3)),
-    "unity": (7, 256, 4.05, 0.0, (1, 2, 3)),
-    "unreal": (8, 128, 3.8, 0.0, (1, 2, 3)),
-    "own": (4, 64, 2 + 1 / 3, 1 / 8, (3, -1, 2)),
-    "maps": (4, 64, 1.5, 0.0, (1, 2, 3)),
-    "atlas": (4, 64, 1.5, 0.0, (1, 2, 3)),
-    "edges": (4, 64, 1.5, 0.0, (1, 2, 3)),
-}
-# (u, v) of the table at n·v = .3, r = .5, and whether what is read there is (A, B) or (∫Fc, ∫1).
-TABLE = {"filament": (0.3, 0.5, False), "three": (0.5, 0.3, True), "babylon": (0.3, 0.5, False),
-         "bevy": (0.3, 0.5, True), "gltf": (0.3, 0.5, True),
-         "khronos": (0.3, 0.5, True), "own": (0.25, (0.3**0.5 * 31 + 0.5) / 32, True)}
-BLEND = {"babylon": 0.25 + MINIMUM_VARIANCE, "own": 0.25 * 0.25}
+PUBLISHED = {name: preset.published for name, preset in PRESETS.items() if preset.published is not None} | {
+    "own": Published(4, 64, 2 + 1 / 3, 1 / 8, 0.25 * 0.25, (3, -1, 2), (0.25, (0.3**0.5 * 31 + 0.5) / 32)),
+    "maps": Published(4, 64, 1.5), "atlas": Published(4, 64, 1.5), "edges": Published(4, 64, 1.5)}
+"""What each engine computes at r = 1/2, from what is published of it."""
 
 
 def text_of(engine: Engine, language: str) -> str:
-    levels, width, *_ = HALF[engine.name]
-    return snippet(engine, language, levels, width, "studio")
+    published = PUBLISHED[engine.name]
+    return snippet(engine, language, published.levels, published.width, "studio")
 
 
 # ------------------------------------------------------------------------------------------------- compilers
@@ -164,7 +144,7 @@ def irradiance(n: np.ndarray) -> np.ndarray:
 
 
 def stored(engine: Engine, d: np.ndarray) -> np.ndarray:
-    return np.array([np.sign(a) * d[abs(a) - 1] for a in HALF[engine.name][4]])
+    return np.array([np.sign(a) * d[abs(a) - 1] for a in PUBLISHED[engine.name].direction])
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +202,8 @@ CLOSE = 4e-6
 @pytest.mark.parametrize("language", LANGUAGES)
 @pytest.mark.parametrize("engine", BAKED, ids=lambda e: e.name)
 def test_a_snippet_reads_what_the_engine_reads(executed, engine, language):
-    lod, bend = HALF[engine.name][2:4]
+    published = PUBLISHED[engine.name]
+    lod, bend = published.lod, published.bend
     got = executed[engine.name, language, 0.5]
     assert got[0] == pytest.approx(lod, abs=CLOSE)
     mirror = 2 * (N @ V) * N - V
@@ -237,7 +218,7 @@ def test_a_snippet_reads_what_the_engine_reads(executed, engine, language):
     elif engine in (ATLAS, EDGES):
         diffuse = read_octahedral(engine, N, 3)
     else:
-        diffuse = stored(engine, N) * (1 + {"three": 5, "unity": 6, "unreal": 5}[engine.name])
+        diffuse = stored(engine, N) * (1 + published.diffuse_lod)
     # Babylon's constants of its polynomials have six digits.
     np.testing.assert_allclose(got[7:10], diffuse, atol=2e-5 if engine.sh == "babylon" else CLOSE)
     if engine in (MAPS, ATLAS, EDGES):
@@ -246,13 +227,14 @@ def test_a_snippet_reads_what_the_engine_reads(executed, engine, language):
         radiance = stored(engine, direction) * (1 + lod)
         if engine.holding("sheen"):
             np.testing.assert_allclose(got[18:21], 3 * radiance, atol=3 * CLOSE)
-        radiance = radiance + (diffuse - radiance) * BLEND.get(engine.name, 0)
+        radiance = radiance + (diffuse - radiance) * published.blend
     np.testing.assert_allclose(got[10:13], radiance, atol=2e-5)
     if engine.holding("dfg"):
-        u, v, scaled = TABLE[engine.name]
+        u, v = published.table
         np.testing.assert_allclose(got[13:15], (u, v), atol=CLOSE)
         F0 = np.array([0.1, 0.5, 1.0])
-        np.testing.assert_allclose(got[15:18], F0 * u + v if scaled else u + (v - u) * F0, atol=CLOSE)
+        albedo = F0 * u + v if published.form == "scale_bias" else u + (v - u) * F0
+        np.testing.assert_allclose(got[15:18], albedo, atol=CLOSE)
 
 
 @pytest.mark.parametrize("language", LANGUAGES)

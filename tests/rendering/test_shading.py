@@ -10,7 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from whitefurnace.cli import cli
-from whitefurnace.engines.presets import ENGINES, Dfg, Engine, File
+from whitefurnace.engines.presets import ENGINES, PRESETS, Dfg, Engine, File
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.files import (
     EnvMap,
@@ -43,11 +43,11 @@ MAPS, ATLAS = (
     for name, suffix, border in (("maps", ".ktx2", 0), ("atlas", ".exr", 2)))
 ALL = [engine for engine in ENGINES.values() if engine.holding("specular") or engine.container != "files"]
 ALL += [OWN, MAPS, ATLAS]
-AXES = {"three": (-1, 2, 3), "babylon": (1, 2, -3), "bevy": (1, 2, -3), "own": (3, -1, 2)}
+AXES = {name: preset.published.direction for name, preset in PRESETS.items() if preset.published} | {"own": (3, -1, 2)}
 """Of the world's axes those that the stored direction has; (1, 2, 3) where nothing is said."""
-LEVELS = {"filament": 5, "three": 4, "babylon": 7, "unity": 7, "unreal": 7}
+LEVELS = {"filament": 5, "three": 4} | {name: 7 for name, engine in ENGINES.items() if engine.whole or engine.levels}
 """Of chains from 64², 3 where nothing is said: down to 16², or 8², or 1², as the presets want."""
-IMPORTED = ("unity", "unreal")
+IMPORTED = tuple(engine.name for engine in ALL if engine.container == "files" and not engine.holding("dfg"))
 """No table of ours: their weights of white metal are those of Karis's fit."""
 
 
