@@ -1,6 +1,7 @@
 // Sources for the prefilter: quadrature nodes of the texels as a list, and their anterpolation onto an
 // equiangular cube grid, the adjoint of ORDER-point Lagrange interpolation. Where box-filtered mips keep only
 // each texel's energy, this keeps the moments: ∑ K(l_a) ∫ L φ_a dω reproduces ∫ L K dω to O((h/α)^ORDER).
+// The host defines PATCH and TAPS.
 
 #if W == 1
 #define FLOATS float
@@ -11,7 +12,9 @@
 #define LOAD_FLOATS(p) JOIN(vload, W)(0, p)
 #define STORE_FLOATS(v, p) JOIN(vstore, W)(v, 0, p)
 #endif
-#define TAPS 9
+#if ORDER != 8
+#error "a row of a stencil is two vectors of 16 numbers here: 8 nodes of 4"
+#endif
 
 // Each texel in cuts × cuts parts of its radiance; columns are those of `out`.
 __kernel void cut_texels(__global float *restrict out, __global const float *restrict in, const int columns,
@@ -107,7 +110,6 @@ __kernel void chosen_nodes(__global scalar *restrict list, const int first, cons
 static inline int stencil_start(int gap, int n) { return clamp(gap - (ORDER / 2 - 1), 0, n - ORDER); }
 
 // Gaps of a face are served in blocks of PATCH × PATCH, each by one work item that sums into the nodes its stencils reach.
-#define PATCH 16
 #define REACHED (PATCH + ORDER - 1)
 #if PRECISION == 64
 #define QUAD double4

@@ -12,8 +12,8 @@
 //
 // partial: [split][8·CHANNELS + 1][outputs], CHANNELS = 3·PERMS: the sums, then ∑K w.
 
-#define RUN 64   // classes whose kernel values wait in cache while they are summed
-#define TILE 16  // classes that are taken or left together, 4 × 4 neighbours
+// The host defines RUN, the classes whose kernel values wait in cache while they are summed, TILE, those that are taken
+// or left together, and RUN_EDGE and TILE_EDGE, their roots: classes are neighbours in squares.
 #if PRECISION == 64
 #define QUAD double4
 #else
@@ -21,13 +21,13 @@
 #endif
 
 // A class as whole numbers: its grid coordinates, odd and positive, and n along its face's axis. Classes are quarter faces
-// +x +y +z, where n is a multiple of 16 in tiles of 4 × 4 within 8 × 8.
+// +x +y +z, in tiles within runs where a quarter face is made of whole runs.
 static inline xyz class_numbers(int c, int n) {
   const int half_n = n / 2, face = c / (half_n * half_n), rest = c % (half_n * half_n);
-  const int block = rest / 64, tile = rest / 16 % 4, in_tile = rest % 16, across = half_n / 8;
-  const int tiled = half_n % 8 == 0;
-  const int i = tiled ? block / across * 8 + tile / 2 * 4 + in_tile / 4 : rest / half_n;
-  const int j = tiled ? block % across * 8 + tile % 2 * 4 + in_tile % 4 : rest % half_n;
+  const int run = rest / RUN, tile = rest / TILE % (RUN / TILE), in_tile = rest % TILE;
+  const int across = half_n / RUN_EDGE, tiles = RUN_EDGE / TILE_EDGE, tiled = half_n % RUN_EDGE == 0;
+  const int i = tiled ? run / across * RUN_EDGE + tile / tiles * TILE_EDGE + in_tile / TILE_EDGE : rest / half_n;
+  const int j = tiled ? run % across * RUN_EDGE + tile % tiles * TILE_EDGE + in_tile % TILE_EDGE : rest % half_n;
   const scalar s = 2 * j + 1, t = 2 * i + 1;
   const xyz d = {face == 0 ? n : face == 1 ? t : s, face == 1 ? n : face == 2 ? t : s, face == 2 ? n : face == 1 ? s : t};
   return d;
@@ -170,7 +170,7 @@ __kernel void convolve_close(__global scalar *restrict partial, const int output
   real K[RUN];
   for (int first = split * chunk; first < end; first += RUN)
     for (int g = g0; g < g1; g++) {
-      __global const scalar *bound = tile + 20 * (size_t)((origin + first) / RUN), *own = group + 4 * g;
+      __global const scalar *bound = tile + (size_t)((origin + first) / RUN) * (1 + RUN / TILE) * 4, *own = group + 4 * g;
       const real x = LOAD(g, direction), y = LOAD(g, direction + outputs), z = LOAD(g, direction + 2 * outputs);
       for (int s = 0; s < 8; s++) {
         const xyz one = {1, 1, 1}, sign = reflected(one, s);

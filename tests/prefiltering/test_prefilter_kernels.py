@@ -11,11 +11,11 @@ import pytest
 import reference
 from whitefurnace.catalogue import models
 from whitefurnace.catalogue.choice import chosen
+from whitefurnace.opencl import constants
 from whitefurnace.opencl.derived import lobe_norm
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering import plan
 from whitefurnace.prefiltering.convolution import COSINE, Convolver, Lobe, Shape, ndf_lobe
-from whitefurnace.sphere import grids
 from whitefurnace.sphere.environments import environment
 
 WHERE = Shape(False, 4)
@@ -68,12 +68,12 @@ def test_anterpolation_has_its_order(device: Device, source: tuple[int, ...], al
     want = truth(texels, alpha, 8, 21.0)
     errors = [float(np.sqrt(np.mean((convolved(device, texels, ggx(device, alpha), n << k, 21.0) / want - 1) ** 2)))
               for k in range(3)]
-    nodes = [(n << k) - 2 * grids.BEYOND for k in range(3)]  # on a face
+    nodes = [(n << k) - 2 * constants.BEYOND for k in range(3)]  # on a face
     pairs = [(math.log(a / b) / math.log(y / x)) for (a, b), (x, y) in
              zip(itertools.pairwise(errors), itertools.pairwise(nodes), strict=True) if b > 3e-7]  # float32 ends there
     # RATE is what plans scale grids by; ORDER is the limit, which 2 nodes a lobe width are not. With stencils of 4
     # points no doubling falls faster than by the fourth power.
-    assert pairs and plan.RATE - 1 <= max(pairs) <= grids.ORDER + 1, (alpha, source, errors, pairs)
+    assert pairs and plan.RATE - 1 <= max(pairs) <= constants.ORDER + 1, (alpha, source, errors, pairs)
 
 
 @pytest.mark.parametrize("alpha", [0.03, 0.05, 0.2, 1.0])

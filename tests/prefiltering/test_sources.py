@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from reference import gauss, texel_nodes
+from whitefurnace.opencl import constants
 from whitefurnace.opencl.device import Device
 from whitefurnace.prefiltering.lobes import COSINE
 from whitefurnace.prefiltering.sources import Texels
-from whitefurnace.sphere import grids
 from whitefurnace.sphere.environments import environment
 
 DEGREE = 4
@@ -189,7 +189,7 @@ def test_grids_keep_the_moments(device: Device, nothing_bright: None, source: tu
     want = texel_moments(texels, math.radians(33))
     energy = np.abs(want[0]).max()
     errors = []
-    for n in (12 + 2 * grids.BEYOND, 24 + 2 * grids.BEYOND, 48 + 2 * grids.BEYOND):
+    for n in (12 + 2 * constants.BEYOND, 24 + 2 * constants.BEYOND, 48 + 2 * constants.BEYOND):
         t = Texels(device, environment(texels, rotate=33), 64 if device.fp64 else 32)
         t.prepare(n, cuts)
         listed = t.grid_list(n).read().astype(np.float64)
@@ -200,7 +200,7 @@ def test_grids_keep_the_moments(device: Device, nothing_bright: None, source: tu
     assert errors[2] <= 1e-6, (source, errors)
     for coarse, fine in itertools.pairwise(errors):
         # One order is what noise may hide between two grids; 1e-8 is where other errors take over.
-        assert fine <= coarse / 2 ** (grids.ORDER - 1) or fine <= 3 * least, (source, errors)
+        assert fine <= coarse / 2 ** (constants.ORDER - 1) or fine <= 3 * least, (source, errors)
 
 
 @pytest.mark.parametrize("source", [(32, 64), (6, 16, 16)], ids=str)

@@ -9,10 +9,11 @@ import pytest
 
 from whitefurnace.catalogue import models
 from whitefurnace.catalogue.choice import chosen
+from whitefurnace.opencl.constants import RUN, TILE
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.lobes import COSINE, Lobe, ndf_lobe
 from whitefurnace.prefiltering.plan import Part, Window
-from whitefurnace.prefiltering.symmetry import RUN, TILE, Octahedral, Orbits, orbits, tile_bounds
+from whitefurnace.prefiltering.symmetry import Octahedral, Orbits, orbits, tile_bounds
 from whitefurnace.sphere.grids import Shape, grid_tangents
 
 CUBES = [Shape(False, n) for n in (1, 2, 4, 16, 32, 33)]

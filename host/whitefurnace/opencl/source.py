@@ -9,6 +9,7 @@ from importlib import resources
 from typing import Any
 
 from whitefurnace.catalogue import Integral, Model
+from whitefurnace.opencl import constants
 
 # Kernel functions by the macro that binds them: the name's ending and its own arguments, s a number, v a vector,
 # d a direction (a cosine for isotropic NDFs, a vector for anisotropic ones).
@@ -329,7 +330,8 @@ def near_texels(kind: str, ndf: Model) -> Source:
 @_kept
 def octahedral() -> Source:
     """The zonal convolution by the symmetries of the cube, of any lobe."""
-    return _assemble(["real.clh", "sphere.clh", "orbits.clh", "window.clh", "lobe_table.clh", "octahedral.cl"])
+    return _assemble(["real.clh", "sphere.clh", ("constants", constants.class_defines()), "orbits.clh", "window.clh",
+                      "lobe_table.clh", "octahedral.cl"])
 
 
 @_kept
@@ -344,14 +346,15 @@ def apart(ndf: Model | None) -> Source:
 @_kept
 def interpolation() -> Source:
     """Levels from their values at the nodes of a grid."""
-    return _assemble(["real.clh", "sphere.clh", "grid.clh", "interpolate.cl"])
+    return _assemble(["real.clh", "sphere.clh", ("constants", constants.grid_defines()), "grid.clh", "interpolate.cl"])
 
 
 @_kept
 def texels(kind: str) -> Source:
     """Nodes and anterpolation of a source of the kind "latlong" or "cube", and spherical harmonics."""
-    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", "grid.clh", "anterpolate.cl",
-                      "harmonics.cl"])
+    shared = constants.grid_defines() + constants.anterpolation_defines()
+    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", ("constants", shared), "grid.clh",
+                      "anterpolate.cl", "harmonics.cl"])
 
 
 @_kept

@@ -8,11 +8,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from whitefurnace.opencl.constants import BEYOND, RUN
 from whitefurnace.prefiltering.recipe import Chain
-from whitefurnace.sphere.grids import BEYOND
-
-PATCH = 16
-"""Gaps an edge of the blocks in which texels are anterpolated; as in `anterpolate.cl`."""
 
 BRIGHT = 64, 256, 1024, 4096
 """Texels of largest radiance × solid angle that are clipped and summed exactly: what a sun or a lamp holds more than
@@ -35,7 +32,7 @@ SYMMETRIC = 8
 
 def splits_for(groups: int, classes: int) -> int:
     """Into how many partial sums a launch of `groups` work items divides its classes, so that all cores are busy."""
-    return max(1, min(-(-SPREAD // groups), classes // 64))
+    return max(1, min(-(-SPREAD // groups), classes // RUN))
 
 
 SPREAD = 16

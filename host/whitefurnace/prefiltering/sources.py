@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from whitefurnace.opencl import source
+from whitefurnace.opencl import constants, source
 from whitefurnace.opencl.device import Buffer, Device, Kernel
 from whitefurnace.prefiltering import plan as planning
 from whitefurnace.prefiltering.lobes import Lobe
-from whitefurnace.sphere import grids
 from whitefurnace.sphere.environments import Environment, channel_range
 from whitefurnace.sphere.grids import (
     coarsening,
@@ -219,8 +218,8 @@ class Texels:
             n = max(n, self._fine[0] if self._fine else 0)
             cuts = self.cuts if self.cuts > 1 or self.centred else 2
             grid = self.device.empty((6, n, n, 4), self.kind)
-            blocks = -(-(n - 1) // planning.PATCH)
-            reached = (planning.PATCH + grids.ORDER - 1) ** 2 * 4
+            blocks = -(-(n - 1) // constants.PATCH)
+            reached = (constants.PATCH + constants.ORDER - 1) ** 2 * 4
             faces = next(f for f in (6, 3, 2, 1) if f == 1 or f * blocks**2 * reached <= PATCHES)
             patches = self.device.empty((faces, blocks**2, reached), self.kind)
             for face in range(0, 6, faces):

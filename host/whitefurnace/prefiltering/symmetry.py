@@ -10,16 +10,11 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.opencl import source
+from whitefurnace.opencl.constants import RUN, RUN_EDGE, TILE, TILE_EDGE
 from whitefurnace.opencl.device import Buffer, Device, Kernel
 from whitefurnace.prefiltering.lobes import Lobe
 from whitefurnace.prefiltering.plan import Part, Window
 from whitefurnace.sphere.grids import Shape, bounds, cube_directions, grid_tangents
-
-TILE = 16
-"""Classes that are taken or left together, as in `octahedral.cl`."""
-
-RUN = 64
-"""Classes whose kernel values wait in cache while they are summed, as there."""
 
 PIECE = 1 << 16
 """Classes of which all images are in memory together: 38 MiB in float32."""
@@ -115,18 +110,21 @@ class Classes:
 
 @cache
 def tile_bounds(n: int) -> np.ndarray:
-    """(3 n²/256, 5, 4): bounds of every 64 classes of the n × n grid, then of each TILE of them."""
-    half = n // 2
+    """Return the centre and radius of every run of classes of the n × n grid, then of each tile in the run.
+
+    The shape is (runs, 1 + tiles in a run, 4); the order of the classes is that of `class_numbers` in `octahedral.cl`.
+    """
+    half, tiles = n // 2, RUN_EDGE // TILE_EDGE
     index = np.arange(half * half)
-    block, tile, inside, across = index // 64, index // 16 % 4, index % 16, half // 8
+    run, tile, inside, across = index // RUN, index // TILE % tiles**2, index % TILE, half // RUN_EDGE
     u = grid_tangents(n)[half:]
-    t = u[block // across * 8 + tile // 2 * 4 + inside // 4]
-    s = u[block % across * 8 + tile % 2 * 4 + inside % 4]
+    t = u[run // across * RUN_EDGE + tile // tiles * TILE_EDGE + inside // TILE_EDGE]
+    s = u[run % across * RUN_EDGE + tile % tiles * TILE_EDGE + inside % TILE_EDGE]
     one = np.ones_like(s)
     d = np.concatenate([np.stack([one, s, t]), np.stack([t, one, s]), np.stack([s, t, one])], 1)
     d /= np.sqrt((d * d).sum(0))
-    outer, inner = bounds(d, 4 * TILE), bounds(d, TILE)
-    return np.concatenate([outer[:, None], inner.reshape(-1, 4, 4)], 1)
+    outer, inner = bounds(d, RUN), bounds(d, TILE)
+    return np.concatenate([outer[:, None], inner.reshape(-1, tiles**2, 4)], 1)
 
 
 class Octahedral:

@@ -10,14 +10,8 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue.rule import gauss
+from whitefurnace.opencl.constants import BEYOND, ORDER, TAPS
 from whitefurnace.sphere.environments import Environment, cube_solid_angles, latlong_solid_angles
-
-ORDER = 8
-"""Points of the Lagrange stencil of the anterpolated grids, as in `anterpolate.cl`. At 1e-3 a sharp lobe needs two
-fifths of the nodes that it needs with 4 points, at 2e-5 a quarter."""
-
-BEYOND = 4
-"""Nodes of a grid past each edge of a face, as there."""
 
 # Axis, right and down of each face, +X -X +Y -Y +Z -Z: the direction of (s, t) is axis + s·right + t·down.
 AXIS = np.array([[1, -1, 0, 0, 0, 0], [0, 0, 1, -1, 0, 0], [0, 0, 0, 0, 1, -1]], np.float64)
@@ -275,7 +269,6 @@ def cube_tables(size: int, x: np.ndarray, w: np.ndarray,
 
 # Mean over |x| ≤ ½ of the quartic through f(-2) … f(2), by moments: 2 c1 + 8 c2 = 1/12, 2 c1 + 32 c2 = 1/80.
 CENTRED = (863 / 960, 77 / 1440, -17 / 5760)
-TAPS = 9
 
 
 @dataclass(frozen=True)
