@@ -18,7 +18,8 @@ from whitefurnace.errors import UsageError
 from whitefurnace.opencl.device import Device
 from whitefurnace.prefiltering.certificate import CONFIDENCE, QUANTILE, rank, statement, texel_errors
 from whitefurnace.prefiltering.convolution import Convolver
-from whitefurnace.prefiltering.lighting import Job, run_jobs
+from whitefurnace.prefiltering.jobs import Job
+from whitefurnace.prefiltering.levels import run_jobs
 from whitefurnace.prefiltering.lobes import ndf_lobe
 from whitefurnace.prefiltering.plan import LevelPlan, cuts_for, grid_size
 from whitefurnace.sphere.environments import environment

@@ -17,6 +17,7 @@ from whitefurnace.opencl.device import Device
 from whitefurnace.prefiltering import lighting
 from whitefurnace.prefiltering import plan as planning
 from whitefurnace.prefiltering.convolution import Convolver
+from whitefurnace.prefiltering.jobs import chain_jobs
 from whitefurnace.prefiltering.means import Means
 from whitefurnace.prefiltering.recipe import QUALITIES, Chain, chain
 from whitefurnace.sphere.environments import Environment, environment
@@ -178,7 +179,7 @@ def _level(env: Environment, device: Device, size: int, alpha: float, tolerance:
                   roughness=math.sqrt(alpha))
     begin = time.perf_counter()
     convolver = Convolver(device, env, precision=planning.precision_for(tolerance))
-    job, = lighting.chain_jobs(convolver, recipe)
+    job, = chain_jobs(convolver, recipe)
     assert job.lobe is not None
     convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance)
     return time.perf_counter() - begin
