@@ -7,7 +7,7 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -20,18 +20,14 @@ from whitefurnace.baking.programs import Program, programs
 from whitefurnace.baking.request import BakeRequest
 from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
 from whitefurnace.engines.presets import Engine, engines, reduced
-from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError
+from whitefurnace.errors import DeviceError, UnsupportedError, UsageError, WhitefurnaceError
 from whitefurnace.files import (
+    FolderOutput,
     Lock,
     Transaction,
-    acquire,
-    after_death,
     digest_file,
-    finish,
-    is_safe,
-    lock_path,
-    read_manifest,
     require_encoder,
+    system_errors,
     write_manifest,
 )
 from whitefurnace.integrals.quadrature import dfg
@@ -247,8 +243,11 @@ def bake_one(request: BakePlan, k: int, device: Device | str | None = None, *, d
 
 @dataclass(frozen=True)
 class Loaded:
-    """An environment that was read and is to be baked. It holds the lock of its output until `write` or `abandon`;
-    `there` is the manifest that is replaced, `made` the folders that were made for it."""
+    """An environment that was read and is to be baked. It holds the lock of its output until `write` or `abandon`.
+
+    recipe, key: what decides the bytes of the output, and their hash. there: the manifest that is replaced.
+    planned: levels, each with the engines it is for. made: folders that were made for the output.
+    """
 
     request: BakePlan
     k: int
@@ -264,9 +263,9 @@ class Loaded:
     begin: float
 
     @property
-    def path(self) -> Path:
-        """Of the manifest."""
-        return manifest_path(self.request, self.k)
+    def output(self) -> FolderOutput:
+        """The files that it becomes."""
+        return _output(self.request, self.k)
 
 
 @dataclass(frozen=True)
@@ -285,39 +284,36 @@ class Computed:
     as_read: list[dict[str, Any]]
 
 
-@contextlib.contextmanager
-def _system_errors(request: BakePlan) -> Iterator[None]:
-    """What the system says of a path in passing, as FileError."""
-    try:
-        yield
-    except OSError as error:
-        raise FileError(f"cannot use {error.filename or request.output}: {error.strerror or error}") from error
-
-
 def manifest_path(request: BakePlan, k: int) -> Path:
     """Where the manifest of the k-th environment is."""
     return request.output / f"{request.names[k]}.json"
 
 
+def _output(request: BakePlan, k: int) -> FolderOutput:
+    return FolderOutput(manifest_path(request, k))
+
+
 def status(request: BakePlan, k: int) -> Baked:
-    """Whether the k-th environment is up to date (`skipped`) or would be baked (`planned`, without a plan), from the
-    bytes of its source and outputs: nothing is decoded. Raises FileError for what cannot be read or is not ours."""
-    with _system_errors(request):
-        name, path = request.names[k], manifest_path(request, k)
-        there = _manifest_at(path, name)
+    """Say whether the k-th environment is up to date, from the bytes of its source and outputs; nothing is decoded.
+
+    Returns a Baked in the state "skipped" or, without a plan, "planned". Raises FileError for a file that cannot be
+    read or is not ours.
+    """
+    with system_errors(request.output):
+        name, output = request.names[k], _output(request, k)
+        there = output.manifest()
         if found := _up_to_date(request, k, there, time.perf_counter()):
             return found
         written = targets_of(request, name)
-        known = [m for m in (there, _manifest_at(Transaction.staging(path), name)) if m]
-        _check_ownership([*(t.path for t in written), path], known, request, path)
+        output.check([t.path for t in written], there, request.force)
         return Baked(name, "planned", tuple(t.path for t in written), {}, (), tuple(t.nbytes for t in written), ())
 
 
 def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: float) -> Baked | None:
-    """The item as its manifest tells it, where that proves it whole and has the key of these source bytes: a skip costs
-    reading them, not decoding them."""
-    item, told = request.sources[k], (there or {}).get("source")
-    if request.force or there is None or not isinstance(told, dict) or not isinstance(item, (str, os.PathLike)) or \
+    """The item as its manifest states it, where that proves it whole and has the key of these source bytes: a skip
+    costs reading them, not decoding them."""
+    item, stated = request.sources[k], (there or {}).get("source")
+    if request.force or there is None or not isinstance(stated, dict) or not isinstance(item, (str, os.PathLike)) or \
             _is_demo(item):
         return None
     try:
@@ -326,25 +322,28 @@ def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: 
         return None
     turn = math.radians(math.remainder(request.rotate, 360.0))
     recipe = _canonical(request, turn, request.exposure or 0.0)
-    if there.get("key") != _key(digest, recipe) or not _whole(there, request.output):
+    if there.get("key") != _key(digest, recipe) or not _output(request, k).is_whole(there):
         return None
     written = targets_of(request, request.names[k])
     return Baked(request.names[k], "skipped", tuple(t.path for t in written), there, (),
-                 tuple(t.nbytes for t in written), tuple(told.get("notices", ())), tuple(there.get("levels", ())),
+                 tuple(t.nbytes for t in written), tuple(stated.get("notices", ())), tuple(there.get("levels", ())),
                  time.perf_counter() - begin)
 
 
 def read(request: BakePlan, k: int, device: Device | str | None = None, *, dry_run: bool = False) -> Baked | Loaded:
-    """Reads the k-th environment of a plan and takes the lock of its output, waiting where another run has it. A
-    Baked where there is nothing to do, or where `dry_run` asks what would be done. No device but for `demo` and a plan.
-    Raises FileError, InputError."""
-    with _system_errors(request):
+    """Read the k-th environment of a plan and take the lock of its output, waiting where another run has it.
+
+    device: used for the built-in environment and for a plan alone.
+    Returns a Baked where there is nothing to do, or where `dry_run` asks what would be done.
+    Raises FileError, InputError.
+    """
+    with system_errors(request.output):
         begin = time.perf_counter()
-        path = manifest_path(request, k)
-        there = _manifest_at(path, request.names[k])
+        output = _output(request, k)
+        there = output.manifest()
         if found := _up_to_date(request, k, there, begin):
             if not dry_run:
-                tidy(path)  # killed when the manifest was there
+                output.tidy()  # killed when the manifest was there
             return found
         if dry_run:
             planned = _read(request, k, device, None, (), there, begin)
@@ -354,9 +353,8 @@ def read(request: BakePlan, k: int, device: Device | str | None = None, *, dry_r
         made = tuple(folder for folder in folders if not folder.exists())
         lock = None
         try:
-            lock = acquire(lock_path(path), folder=True)
-            assert lock is not None
-            there = _settle(path, lock)
+            lock = output.lock()
+            there = output.settle(lock)
             found = _up_to_date(request, k, there, begin)  # of the run that had the lock, or of one that died
             loaded = found or _read(request, k, device, lock, made, there, begin)
         except BaseException:
@@ -367,48 +365,9 @@ def read(request: BakePlan, k: int, device: Device | str | None = None, *, dry_r
         return loaded
 
 
-def tidy(path: Path) -> None:
-    """Completes or removes what a run that was killed left of the output with the manifest at `path`, unless another
-    run is at it. Raises FileError."""
-    after_death(path, _settle)
-
-
-def _settle(path: Path, lock: Lock) -> dict[str, Any] | None:
-    """Completes what a run that was killed between its renames left staged, removes what it left otherwise, and gives
-    the manifest that is there then."""
-    name, staging = path.name.removesuffix(".json"), Transaction.staging(path)
-    there, staged = _manifest_at(path, name), _manifest_at(staging, name)
-    if staged and (there or not os.path.lexists(path)):
-        ours: dict[str, set[Any]] = {}
-        for known in (there, staged):
-            for relative, entry in _entries(known).items() if known else ():
-                ours.setdefault(relative, set()).add(entry.get("sha256"))
-        files = {relative: entry.get("sha256") for relative, entry in staged["files"].items()}
-        renames = finish(path, files, ours)
-        if renames is not None:
-            *first, last = renames
-            stale, _ = _superseded(_engines_of(staged), path.parent, there, files)
-            for source_, target in first:
-                os.replace(source_, target)
-            for file in stale:
-                with contextlib.suppress(OSError):
-                    file.unlink()
-            os.replace(*last)
-            there, staged = staged, None
-    # What could not be completed still proves whose the renamed files are.
-    lock.sweep(keep=[staging] if staged else ())
-    return there
-
-
-def _engines_of(manifest: Mapping[str, Any]) -> list[str]:
-    recipe = manifest.get("recipe")
-    names = recipe.get("for") if isinstance(recipe, dict) else None
-    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []
-
-
 def _read(request: BakePlan, k: int, device: Device | str | None, lock: Lock | None, made: tuple[Path, ...],
           there: dict[str, Any] | None, begin: float) -> Baked | Loaded:
-    name, item, path = request.names[k], request.sources[k], manifest_path(request, k)
+    name, item, output = request.names[k], request.sources[k], _output(request, k)
     on: Device | None = device if isinstance(device, Device) else None
     if _is_demo(item):
         on = on or choose_device(device if isinstance(device, str) else None)
@@ -423,12 +382,10 @@ def _read(request: BakePlan, k: int, device: Device | str | None, lock: Lock | N
     planned = planned_levels(request, math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2))
     files = tuple(t.path for t in written)
     sizes = tuple(t.nbytes for t in written)
-    if not request.force and there and there.get("key") == key and _whole(there, request.output):
+    if not request.force and there and there.get("key") == key and output.is_whole(there):
         return Baked(name, "skipped", files, there, planned, sizes, env.notices,
                      tuple(there.get("levels", ())), time.perf_counter() - begin)
-    # Ours is also what the manifest proves that a killed run left staged.
-    known = [m for m in (there, _manifest_at(Transaction.staging(path), name)) if m]
-    _check_ownership([*files, path], known, request, path)
+    output.check(files, there, request.force)
     if lock is None:
         shown, notices = _would_read(request, env, device, on)
         return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, (*env.notices, *notices),
@@ -436,9 +393,8 @@ def _read(request: BakePlan, k: int, device: Device | str | None, lock: Lock | N
     for engine in request.engines:
         for file in engine.file:
             require_encoder(file.stored)  # before minutes of work, not when the file is written
-    lock.note([*files, path, path.with_name(f"{name}.probe")])
-    for folder in sorted({request.output, *(file.parent for file in files)}):
-        _check_writable(folder, name)
+    lock.note([*files, output.path, output.probe(request.output)])
+    output.check_writable(sorted({request.output, *(file.parent for file in files)}))
     return Loaded(request, k, env, sun, recipe, key, there, planned, lock, made, on, begin)
 
 
@@ -460,12 +416,12 @@ def compute(loaded: Loaded, device: Device | str | None = None,
             progress: Callable[[str, str, float], None] | None = None) -> Computed:
     """All that the device does for an environment. Raises CheckError, DeviceError, UnsupportedError."""
     request, name = loaded.request, loaded.request.names[loaded.k]
-    with _system_errors(request):
+    with system_errors(request.output):
         on = loaded.on or (device if isinstance(device, Device) else choose_device(device))
         tell = (lambda what, share: progress(name, what, share)) if progress else None
         wants, of = _wanted(request)
         lit = light(on, loaded.env, wants, seed=loaded.key, progress=tell)
-        ndf = _Held.of(request.recipe.ndf)
+        ndf = EntryKey.of(request.recipe.ndf)
         table = _table(on, ndf)
         splits = tuple(_split(on, ndf, engine) if engine.holding("dfg") else None for engine in request.engines)
         window = harmonic.windowed(lit.sh, request.window)
@@ -494,7 +450,7 @@ def write(made: Computed) -> Baked:
     """Encodes and writes what was computed, the manifest last, and lets go of the lock. Needs no device. Raises
     FileError; then nothing was written."""
     try:
-        with _system_errors(made.loaded.request):
+        with system_errors(made.loaded.request.output):
             return _write(made)
     finally:
         made.loaded.lock.release()
@@ -519,8 +475,8 @@ def _write(made: Computed) -> Baked:
                 **target.told, "sha256": digest_file(transaction.staged(target.path)),
                 "bytes": transaction.staged(target.path).stat().st_size}
         manifest["files"] = digests
-        stale, manifest["kept"] = _superseded([e.name for e in request.engines], request.output, loaded.there, digests)
-        write_manifest(loaded.path, manifest, into=transaction)
+        stale, manifest["kept"] = loaded.output.superseded(loaded.there, digests)
+        write_manifest(loaded.output.path, manifest, into=transaction)
         transaction.commit(stale)
     seconds = [level.seconds for level, *_ in _rows_of(request, lit, made.of, "levels")]
     rows = tuple({**row, "seconds": s} for row, s in zip(manifest["levels"], seconds, strict=True))
@@ -675,27 +631,6 @@ def _would_read(request: BakePlan, env: Environment, device: Device | str | None
     return tuple(rows), ()
 
 
-def _superseded(engines: Sequence[str], output: Path, there: dict[str, Any] | None,
-                digests: Mapping[str, Any]) -> tuple[list[Path], dict[str, Any]]:
-    """What the old manifest proves ours and a bake for `engines` does not write: files of the same engines, which are
-    stale (a longer chain's last levels), and entries of other engines, which stay and stay ours."""
-    stale, kept = [], {}
-    for relative, entry in _entries(there).items() if there else ():
-        file = output / relative
-        if relative in digests or not file.is_file() or digest_file(file) != entry.get("sha256"):
-            continue
-        if relative.split("/")[0] in engines:
-            stale.append(file)
-        else:
-            kept[relative] = entry
-    return stale, kept
-
-
-def _entries(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Every file that a manifest proves ours, those of earlier bakes for other engines too."""
-    return {**manifest.get("kept", {}), **manifest["files"]}
-
-
 def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str, Any]:
     """The recipe as data: everything that changes the bytes, and nothing else."""
     own = {e.name: {"engine": e.data(), "chain": c.canonical()}
@@ -709,8 +644,8 @@ def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str,
 
 
 @dataclass(frozen=True)
-class _Held:
-    """An NDF as the key of what is kept between the images of a bake: this very entry, not one of the same name."""
+class EntryKey:
+    """An NDF as the key of what a bake keeps between images: one entry itself, not another of the same name."""
 
     identity: int
     given: tuple[tuple[str, Any], ...]
@@ -718,12 +653,12 @@ class _Held:
     """Kept too, so that no other entry takes its identity."""
 
     @staticmethod
-    def of(choice: Chosen) -> _Held:
-        return _Held(id(choice.model), tuple(sorted(choice.given.items())), choice)
+    def of(choice: Chosen) -> EntryKey:
+        return EntryKey(id(choice.model), tuple(sorted(choice.given.items())), choice)
 
 
 @lru_cache(maxsize=4)
-def _table(device: Device, ndf: _Held) -> Integrated:
+def _table(device: Device, ndf: EntryKey) -> Integrated:
     """The DFG table: of the NDF and the device alone, so the same for every image. Not to be written to."""
     table = dfg(DFG_SIZE, ndf=ndf.choice, tolerance=DFG_TOLERANCE, device=device)
     table.values.flags.writeable = False
@@ -731,7 +666,7 @@ def _table(device: Device, ndf: _Held) -> Integrated:
 
 
 @lru_cache(maxsize=16)
-def _split(device: Device, ndf: _Held, engine: Engine) -> SplitSum:
+def _split(device: Device, ndf: EntryKey, engine: Engine) -> SplitSum:
     """The table of a preset, the same for every image."""
     return split_sum(engine.dfg, device=device, ndf=ndf.choice)
 
@@ -741,59 +676,6 @@ def _key(digest: str, recipe: dict[str, Any]) -> str:
     derived numbers take many of them, and the version."""
     parts = [VERSION, digest, json.dumps(recipe, sort_keys=True), source.everything()]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
-    """The manifest of this item at `path`, or None where there is none that could prove anything."""
-    found = read_manifest(path)
-    if found is None or found.get("name") != name:
-        return None
-    for files in (found.get("files"), found.get("kept", {})):
-        if not (isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values())
-                and all(is_safe(relative) for relative in files)):
-            return None
-    return found
-
-
-def _whole(manifest: dict[str, Any], output: Path) -> bool:
-    for relative, entry in manifest["files"].items():
-        path = output / relative
-        if not path.is_file() or digest_file(path) != entry.get("sha256"):
-            return False
-    return True
-
-
-def _check_ownership(paths: Sequence[Path], known: Sequence[dict[str, Any]], request: BakePlan, manifest: Path) -> None:
-    """Refuses to replace what no manifest of ours proves to be ours for this item. Raises FileError."""
-    if request.force:
-        return
-    ours: dict[str, set[Any]] = {}
-    for m in known:
-        for relative, entry in _entries(m).items():
-            ours.setdefault(relative, set()).add(entry.get("sha256"))
-    for path in paths:
-        if not path.exists():
-            continue
-        if path == manifest and known:
-            continue
-        relative = path.relative_to(request.output).as_posix()
-        if relative not in ours or not path.is_file() or digest_file(path) not in ours[relative]:
-            raise FileError(f"{path} is there and was not written by this bake; move it away or give --force")
-
-
-def _check_writable(output: Path, name: str) -> None:
-    """Finds an output folder that cannot be made or written before the work is done, not after."""
-    try:
-        output.mkdir(parents=True, exist_ok=True)
-        probe = Transaction.staging(output / f"{name}.probe")  # no two items of a folder have a name in common
-        probe.unlink(missing_ok=True)  # of a run that was killed, or a link: never written through
-        try:
-            with open(probe, "xb"):
-                pass
-        finally:  # Ctrl-C between the two would leave it there
-            probe.unlink(missing_ok=True)
-    except OSError as error:
-        raise FileError(f"cannot write into {output}: {error.strerror or error}") from error
 
 
 def _manifest(request: BakePlan, name: str, env: Environment, sun: Sun | None, recipe: dict[str, Any], key: str,

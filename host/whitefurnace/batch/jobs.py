@@ -24,7 +24,7 @@ from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import pool
 from whitefurnace.catalogue.choice import file_of
 from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, nearest
-from whitefurnace.files import digest_file, is_lock, is_safe, locks_in, write_text
+from whitefurnace.files import FileOutput, FolderOutput, digest_file, is_lock, is_safe, locks_in, write_text
 from whitefurnace.opencl.device import device_address
 from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
 from whitefurnace.sphere.environments import extent, source_files
@@ -849,7 +849,8 @@ def clean(job: Job) -> None:
             name = lock.name[1:].removesuffix(".lock")
             if name in names or is_lock(lock):
                 with contextlib.suppress(WhitefurnaceError, OSError):
-                    (tables if Path(name).suffix.lower() in tables.FORMS else baking).tidy(folder / f"{name}.json")
+                    form = FileOutput if Path(name).suffix.lower() in tables.FORMS else FolderOutput
+                    form(folder / f"{name}.json").tidy()
     for folder in job.folders:
         with contextlib.suppress(OSError):  # not empty, or never made
             folder.rmdir()

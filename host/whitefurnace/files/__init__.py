@@ -1,5 +1,7 @@
-"""Everything that is read from or written to a file. The only importer of OpenImageIO, which is loaded when
-first needed: it takes longer to load than `--help` may."""
+"""Reads and writes every file of the package.
+
+Only modules of this package import OpenImageIO, and only when they need it: loading it would slow down `--help`.
+"""
 
 from whitefurnace.files.arrays import is_arrays, read_header, read_npy, read_npz
 from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
@@ -13,10 +15,11 @@ from whitefurnace.files.harmonics import read_sh
 from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
 from whitefurnace.files.image import Image, decode_srgb, read_image, srgb_table
 from whitefurnace.files.lights import Light, is_light, light_digest, light_files, read_light, read_radiance
-from whitefurnace.files.lock import Lock, acquire, after_death, finish, is_lock, is_safe, lock_path, locks_in
+from whitefurnace.files.lock import Lock, acquire, is_lock, is_safe, lock_path, locks_in
 from whitefurnace.files.manifest import read_manifest, write_manifest
 from whitefurnace.files.npy import release, scratch, write_npy
 from whitefurnace.files.npz import write_npz
+from whitefurnace.files.ownership import FileOutput, FolderOutput, system_errors
 from whitefurnace.files.packing import pack, unpack
 from whitefurnace.files.png import write_png
 from whitefurnace.files.stored import ImageFacts, image_facts, read_rgbd, read_stored
@@ -25,6 +28,8 @@ from whitefurnace.files.texture import Texture, text_value
 
 __all__ = [
     "EnvMap",
+    "FileOutput",
+    "FolderOutput",
     "Gltf",
     "GltfLight",
     "Image",
@@ -35,13 +40,11 @@ __all__ = [
     "Texture",
     "Transaction",
     "acquire",
-    "after_death",
     "check_table",
     "decode",
     "decode_srgb",
     "digest_file",
     "encode",
-    "finish",
     "identifier",
     "image_facts",
     "is_arrays",
@@ -74,6 +77,7 @@ __all__ = [
     "scratch",
     "srgb_table",
     "stored_format",
+    "system_errors",
     "text_value",
     "unpack",
     "unpack_hdr",

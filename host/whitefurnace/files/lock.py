@@ -7,12 +7,12 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from whitefurnace.errors import FileError
-from whitefurnace.files.atomic import Transaction, digest_file
+from whitefurnace.files.atomic import Transaction
 
 if sys.platform == "win32":
     import msvcrt
@@ -150,26 +150,6 @@ def _left(path: Path, handle: int) -> tuple[str, ...]:
         raise FileError(f"{path} is there and is not our lock; move it away") from None
 
 
-def finish(manifest: Path, files: Mapping[str, Any],
-           ours: Mapping[str, Collection[Any]]) -> list[tuple[Path, Path]] | None:
-    """The renames that complete what a death between renames left: of each of `files`, named relative to the manifest's
-    folder with their sha256, that is still staged, and of the manifest itself. None where one is neither staged nor
-    there, or would replace a file that is none of `ours`."""
-    renames = []
-    for relative, digest in files.items():
-        target = manifest.parent / relative
-        staged = Transaction.staging(target)
-        there = digest_file(target) if target.is_file() and not target.is_symlink() else None
-        if there == digest:
-            continue
-        if not (staged.is_file() and not staged.is_symlink() and digest_file(staged) == digest):
-            return None
-        if os.path.lexists(target) and there not in ours.get(relative, ()):
-            return None
-        renames.append((staged, target))
-    return [*renames, (Transaction.staging(manifest), manifest)]
-
-
 def is_lock(path: Path) -> bool:
     """Whether a file is one of our locks, by what a holder noted in it."""
     try:
@@ -186,13 +166,3 @@ def locks_in(folder: Path) -> list[Path]:
             return sorted(folder / e.name for e in entries if e.name.startswith(".") and e.name.endswith(_SUFFIX))
     except OSError:
         return []
-
-
-def after_death(path: Path, settle: Callable[[Path, Lock], object]) -> None:
-    """Lets `settle` mend the output with the manifest at `path` where a run died at it, unless another is at it now.
-    Raises FileError."""
-    if lock_path(path).exists() and (lock := acquire(lock_path(path), wait=False)):
-        try:
-            settle(path, lock)
-        finally:
-            lock.release()

@@ -12,19 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from whitefurnace.catalogue.choice import Spec
-from whitefurnace.errors import FileError
 from whitefurnace.files import (
-    Lock,
+    FileOutput,
     Transaction,
-    acquire,
-    after_death,
     digest_file,
-    finish,
     identifier,
-    lock_path,
-    read_manifest,
     release,
     scratch,
+    system_errors,
     write_exr,
     write_manifest,
     write_npy,
@@ -126,32 +121,35 @@ def lut(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence[i
 def make(request: TablePlan, device: Device | str | None = None, *, dry_run: bool = False,
          progress: Progress | None = None) -> Table:
     """Make a table as planned, or say what would be done. Raises what `lut` raises."""
-    try:
+    with system_errors(request.path):
         return _make(request, device, dry_run, progress)
-    except OSError as error:  # what the system says of a path in passing
-        raise FileError(f"cannot use {error.filename or request.path}: {error.strerror or error}") from error
 
 
 def _make(request: TablePlan, device: Device | str | None, dry_run: bool, progress: Progress | None) -> Table:
     begin = time.perf_counter()
-    key = request.key()
-    there = _manifest_at(request.manifest_path, request.path.name)
+    key, output = request.key(), FileOutput(request.manifest_path)
     plain = Table(request.kind, request.path, "planned", request.shape, request.axes, request.nbytes,
                   {"key": key, "recipe": request.canonical()})
-    if not request.force and there and there.get("key") == key and _proves(there, request.path):
-        if not dry_run:
-            tidy(request.manifest_path)
+
+    def up_to_date(there: dict[str, Any] | None) -> Table | None:
+        if request.force or there is None or there.get("key") != key or not output.is_whole(there):
+            return None
         return replace(plain, state="skipped", manifest=there, seconds=time.perf_counter() - begin)
-    _check_ownership(request, there)
+
+    there = output.manifest()
+    if found := up_to_date(there):
+        if not dry_run:
+            output.tidy()
+        return found
+    output.check([request.path], there, request.force)
     if dry_run:
         return plain
-    lock = acquire(lock_path(request.manifest_path))
-    assert lock is not None
+    lock = output.lock()
     try:
-        there = _settle(request.manifest_path, lock)
-        if not request.force and there and there.get("key") == key and _proves(there, request.path):
-            return replace(plain, state="skipped", manifest=there, seconds=time.perf_counter() - begin)
-        _check_ownership(request, there)
+        there = output.settle(lock)
+        if found := up_to_date(there):
+            return found
+        output.check([request.path], there, request.force)
         lock.note([request.path, request.manifest_path])
         return _made(request, device, key, plain, begin, progress)
     finally:
@@ -291,54 +289,4 @@ def _manifest(request: TablePlan, key: str, device: Device | None, made: Integra
     return whole if device is None else {**whole, "device": device.identity()}
 
 
-# ---------------------------------------------------------------------------------------------- ownership
-
-
-def _manifest_at(path: Path, name: str) -> dict[str, Any] | None:
-    found = read_manifest(path)
-    return found if found is not None and found.get("name") == name else None
-
-
-def tidy(path: Path) -> None:
-    """Completes or removes what a run that was killed left of the table with the manifest at `path`, unless another run
-    is at it. Raises FileError."""
-    after_death(path, _settle)
-
-
-def _settle(path: Path, lock: Lock) -> dict[str, Any] | None:
-    """Completes what a run that was killed between its renames left staged, removes what it left otherwise, and gives
-    the manifest that is there then."""
-    name, staging = path.name.removesuffix(".json"), Transaction.staging(path)
-    there, staged = _manifest_at(path, name), _manifest_at(staging, name)
-    if staged and (there or not os.path.lexists(path)):
-        renames = finish(path, {name: staged.get("sha256")}, {name: {m.get("sha256") for m in (there, staged) if m}})
-        if renames is not None:
-            for source, target in renames:
-                os.replace(source, target)
-            there, staged = staged, None
-    # What could not be completed still proves whose the renamed file is.
-    lock.sweep(keep=[staging] if staged else ())
-    return there
-
-
-def _proves(manifest: Mapping[str, Any], path: Path) -> bool:
-    return path.is_file() and digest_file(path) == manifest.get("sha256")
-
-
-def _check_ownership(request: TablePlan, there: dict[str, Any] | None) -> None:
-    """Refuses to replace what no manifest of ours proves ours. Raises FileError."""
-    path, beside = request.path, request.manifest_path
-    for target in (path, beside):
-        if target.is_dir():
-            raise FileError(f"cannot write {target}: it is a folder")
-    if request.force:
-        return
-    # Ours is also what a run that was killed between its renames left staged.
-    known = [m for m in (there, _manifest_at(Transaction.staging(beside), request.path.name)) if m]
-    for target in (path, beside):
-        ours = any(_proves(m, path) for m in known) if target == path else bool(known)
-        if target.exists() and not ours:
-            raise FileError(f"{target} is there and was not written by this command; move it away or give --force")
-
-
-__all__ = ["FORMS", "Table", "TablePlan", "TableRequest", "lut", "make", "plan", "tidy"]
+__all__ = ["FORMS", "Table", "TablePlan", "TableRequest", "lut", "make", "plan"]

@@ -1,0 +1,240 @@
+"""Who may overwrite an output, and what is done about a run that was killed while it wrote one.
+
+An output is a manifest and the files beside it that the manifest proves ours by their sha256. One writer at a time
+holds its lock. A `Transaction` renames the files first and the manifest last; a run that was killed between two renames
+leaves the manifest staged, which tells the next run whose the files are. Bakes and tables differ only in the form of
+their manifests: `FolderOutput` and `FileOutput`.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from whitefurnace.errors import FileError
+from whitefurnace.files.atomic import Transaction, digest_file
+from whitefurnace.files.lock import Lock, acquire, is_safe, lock_path
+from whitefurnace.files.manifest import read_manifest
+
+
+@contextlib.contextmanager
+def system_errors(path: Path) -> Iterator[None]:
+    """Raise a FileError for what the system says of a file in passing, `path` where it names none."""
+    try:
+        yield
+    except OSError as error:
+        raise FileError(f"cannot use {error.filename or path}: {error.strerror or error}") from error
+
+
+class Output(ABC):
+    """The files that one manifest proves ours.
+
+    path: of the manifest, `NAME.json`. Files are named by their paths relative to its folder.
+    """
+
+    writer: ClassVar[str]
+    """Who writes such outputs, as errors say it."""
+
+    makes_folder: ClassVar[bool] = False
+    """Whether the folder is made where it is missing."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.folder = path, path.parent
+        self.name = path.name.removesuffix(".json")
+
+    @abstractmethod
+    def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
+        """sha256 of each file that a manifest proves whole; None where it is no manifest of this form."""
+
+    def kept(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
+        """sha256 of each file of earlier writers that a manifest still proves ours."""
+        return {}
+
+    def stale(self, there: dict[str, Any] | None, written: Iterable[str]) -> list[Path]:
+        """Files that the manifest `there` proves ours and that the files `written` make useless."""
+        return []
+
+    # ------------------------------------------------------------------------------------------ manifests
+
+    def manifest(self) -> dict[str, Any] | None:
+        """The manifest, or None where there is none that could prove anything. Raises FileError."""
+        return self._manifest(self.path)
+
+    def staged(self) -> dict[str, Any] | None:
+        """The manifest that a run that was killed left staged, or None. Raises FileError."""
+        return self._manifest(Transaction.staging(self.path))
+
+    def _manifest(self, path: Path) -> dict[str, Any] | None:
+        found = read_manifest(path)
+        return found if found and found.get("name") == self.name and self.digests(found) is not None else None
+
+    def is_whole(self, manifest: Mapping[str, Any]) -> bool:
+        """Whether every file is there with the bytes that the manifest states. Raises FileError."""
+        return all(self._has(self.folder / name, [digest]) for name, digest in (self.digests(manifest) or {}).items())
+
+    def _has(self, file: Path, digests: Iterable[Any]) -> bool:
+        return file.is_file() and digest_file(file) in digests
+
+    def _ours(self, manifests: Iterable[dict[str, Any] | None]) -> dict[str, list[Any]]:
+        """For each file the sha256 that make it ours."""
+        found: dict[str, list[Any]] = {}
+        for manifest in filter(None, manifests):
+            for name, digest in {**self.kept(manifest), **(self.digests(manifest) or {})}.items():
+                found.setdefault(name, []).append(digest)
+        return found
+
+    # ------------------------------------------------------------------------------------------ ownership
+
+    def check(self, files: Sequence[Path], there: dict[str, Any] | None, force: bool) -> None:
+        """Refuse to overwrite files, or the manifest, that are not ours.
+
+        files: what is to be written. there: the manifest that is there. force: whether the user allows it.
+        Raises FileError.
+        """
+        if force:
+            return
+        known = [there, self.staged()]
+        ours = self._ours(known)
+        for path in (*files, self.path):
+            if not path.exists() or (path == self.path and any(known)):
+                continue
+            if not self._has(path, ours.get(path.relative_to(self.folder).as_posix(), ())):
+                raise FileError(f"{path} is there and was not written by {self.writer}; move it away or give --force")
+
+    def lock(self) -> Lock:
+        """Wait for the lock of the output and take it. Raises FileError."""
+        lock = acquire(lock_path(self.path), folder=self.makes_folder)
+        assert lock is not None
+        return lock
+
+    # ------------------------------------------------------------------------------------------ recovery
+
+    def settle(self, lock: Lock) -> dict[str, Any] | None:
+        """Complete or remove what a run that was killed left, and return the manifest that is there then.
+
+        What was staged is completed where all of it is there and no foreign file would be replaced. Raises FileError.
+        """
+        there, staged = self.manifest(), self.staged()
+        if staged and (there or not os.path.lexists(self.path)):
+            digests = self.digests(staged) or {}
+            renames = self._renames(digests, self._ours((there, staged)))
+            if renames is not None:
+                stale = self.stale(there, digests)
+                for source, target in renames:
+                    os.replace(source, target)
+                for file in stale:  # before the manifest that proves it ours is replaced
+                    with contextlib.suppress(OSError):
+                        file.unlink()
+                os.replace(Transaction.staging(self.path), self.path)
+                there, staged = staged, None
+        # What could not be completed still proves whose the renamed files are.
+        lock.sweep(keep=[Transaction.staging(self.path)] if staged else ())
+        return there
+
+    def _renames(self, digests: Mapping[str, Any], ours: Mapping[str, Sequence[Any]]) -> list[tuple[Path, Path]] | None:
+        """The renames of staged files that make the output whole; None where a file is neither staged nor there, or
+        where a file that is not ours would be replaced."""
+        renames = []
+        for name, digest in digests.items():
+            target = self.folder / name
+            staged = Transaction.staging(target)
+            there = digest_file(target) if target.is_file() and not target.is_symlink() else None
+            if there == digest:
+                continue
+            if staged.is_symlink() or not self._has(staged, [digest]):
+                return None
+            if os.path.lexists(target) and there not in ours.get(name, ()):
+                return None
+            renames.append((staged, target))
+        return renames
+
+    def tidy(self) -> None:
+        """Complete or remove what a run that was killed left, unless another run holds the lock. Raises FileError."""
+        path = lock_path(self.path)
+        if path.exists() and (lock := acquire(path, wait=False)):
+            try:
+                self.settle(lock)
+            finally:
+                lock.release()
+
+
+class FileOutput(Output):
+    """A table: FILE, and its manifest FILE.json with the sha256 of FILE."""
+
+    writer = "this command"
+
+    def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
+        return {self.name: manifest.get("sha256")}
+
+    def check(self, files: Sequence[Path], there: dict[str, Any] | None, force: bool) -> None:
+        for path in (*files, self.path):
+            if path.is_dir():
+                raise FileError(f"cannot write {path}: it is a folder")
+        super().check(files, there, force)
+
+
+class FolderOutput(Output):
+    """A bake: `ENGINE/STEM…` for several engines, and one manifest STEM.json that lists them.
+
+    `files` of the manifest are what its bake wrote, `kept` what earlier bakes wrote for other engines.
+    """
+
+    writer, makes_folder = "this bake", True
+
+    def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
+        for files in (manifest.get("files"), manifest.get("kept", {})):
+            if not (isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values())
+                    and all(is_safe(name) for name in files)):
+                return None
+        return {name: entry.get("sha256") for name, entry in manifest["files"].items()}
+
+    def kept(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: entry.get("sha256") for name, entry in manifest.get("kept", {}).items()}
+
+    def stale(self, there: dict[str, Any] | None, written: Iterable[str]) -> list[Path]:
+        return self.superseded(there, written)[0]
+
+    def superseded(self, there: dict[str, Any] | None, written: Iterable[str]) -> tuple[list[Path], dict[str, Any]]:
+        """What the manifest `there` proves ours beside the files `written`.
+
+        Returns stale files of the same engines (such as the last levels of a longer chain), and the manifest's entries
+        of files of other engines, which stay. Raises FileError.
+        """
+        new = set(written)
+        engines = {name.split("/")[0] for name in new}
+        stale: list[Path] = []
+        kept: dict[str, Any] = {}
+        for name, entry in {**there.get("kept", {}), **there["files"]}.items() if there else ():
+            file = self.folder / name
+            if name in new or not self._has(file, [entry.get("sha256")]):
+                continue
+            if name.split("/")[0] in engines:
+                stale.append(file)
+            else:
+                kept[name] = entry
+        return stale, kept
+
+    def check_writable(self, folders: Iterable[Path]) -> None:
+        """Make folders and a file in each, so that what cannot be written is found before the work and not after it.
+
+        The caller notes `probe` of the folder of the manifest in the lock. Raises FileError.
+        """
+        for folder in folders:
+            try:
+                folder.mkdir(parents=True, exist_ok=True)
+                probe = Transaction.staging(self.probe(folder))
+                probe.unlink(missing_ok=True)  # of a run that was killed, or a link: never written through
+                try:
+                    with open(probe, "xb"):
+                        pass
+                finally:  # Ctrl-C between the two would leave it there
+                    probe.unlink(missing_ok=True)
+            except OSError as error:
+                raise FileError(f"cannot write into {folder}: {error.strerror or error}") from error
+
+    def probe(self, folder: Path) -> Path:
+        """The file that `check_writable` stages in a folder; no two outputs of a folder have a name in common."""
+        return folder / f"{self.name}.probe"
