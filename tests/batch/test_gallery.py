@@ -26,7 +26,7 @@ from whitefurnace.batch.jobs import Result
 from whitefurnace.engines.presets import ENGINES
 from whitefurnace.errors import FileError
 from whitefurnace.files import decode_srgb, write_exr
-from whitefurnace.rendering import thumbnails as strips
+from whitefurnace.rendering import thumbnails
 from whitefurnace.sphere.grids import cube_centres, turned_cube
 
 VOID = {"meta", "col", "img", "input", "br", "rect"}  # rect: <rect/> in SVG
@@ -254,12 +254,12 @@ def test_a_strip_shows_each_direction_where_it_is(name):
     """In the axes of every engine: three.js mirrors its faces."""
     cube = by_direction(64)
     matrix = ENGINES[name].matrix
-    matte = (0.5 + 0.5 * strips.normals()).T
+    matte = (0.5 + 0.5 * thumbnails.normals()).T
     stored = turned_cube(cube, matrix)
-    picture = strips.strip([stored, stored[:, ::4, ::4]], matte, matrix)
-    assert picture.shape == (strips.CELL, 5 * strips.CELL, 4)
-    shown = 2 * linear(picture[..., :3], strips.exposure_of(cube)) - 1
-    c = strips.CELL
+    picture = thumbnails.thumbnail([stored, stored[:, ::4, ::4]], matte, matrix)
+    assert picture.shape == (thumbnails.CELL, 5 * thumbnails.CELL, 4)
+    shown = 2 * linear(picture[..., :3], thumbnails.exposure_of(cube)) - 1
+    c = thumbnails.CELL
     # ½/255 of sRGB and the width of a pixel, .05 rad, beside what 32² texels a face leave.
     near = dict(abs=0.08)
     assert shown[c // 2, c] == pytest.approx([1, 0, 0], **near)  # +X in the middle of the panorama,
@@ -283,13 +283,13 @@ def test_a_furnace_is_grey_at_any_radiance():
     srgb = 1.055 * curve ** (1 / 2.4) - 0.055
     for radiance in (1e-6, 1.0, 3e4):
         cube = np.full((6, 16, 16, 3), radiance, np.float32)
-        matte = np.full((strips.normals().shape[1], 3), radiance)
-        picture = strips.strip([cube], matte)
+        matte = np.full((thumbnails.normals().shape[1], 3), radiance)
+        picture = thumbnails.thumbnail([cube], matte)
         colours = picture[picture[..., 3] > 0][:, :3].astype(int)
         assert np.abs(colours - 255 * srgb).max() <= 1, radiance  # rounded to 8 bits
-    assert not strips.strip([np.zeros((6, 4, 4, 3), np.float32)], np.zeros_like(matte))[..., :3].any()
+    assert not thumbnails.thumbnail([np.zeros((6, 4, 4, 3), np.float32)], np.zeros_like(matte))[..., :3].any()
     cube[2, 3, 4] = np.inf  # as a half of over 65504 is read: it decides on nothing
-    assert (strips.strip([cube], matte) == picture).all()
+    assert (thumbnails.thumbnail([cube], matte) == picture).all()
 
 
 def test_every_engine_shows_the_same_sky(baked, tmp_path, device):
@@ -298,9 +298,9 @@ def test_every_engine_shows_the_same_sky(baked, tmp_path, device):
     for name in ("raw", "exr", "filament", "three", "godot"):
         bake(source, tmp_path / name, for_=name, size=32, tolerance=1e-2, device=device)
         manifest = tmp_path / name / f"{NAMES[0]}.json"
-        picture = strips.strip(*strips.read_strip(manifest, json.loads(manifest.read_text("utf-8"))))
-        pictures[name] = picture[:, : 2 * strips.CELL, :3].astype(int)
-        matte = picture[strips.CELL // 2, -strips.CELL // 2, :3].astype(int)
+        picture = thumbnails.thumbnail(*thumbnails.read_thumbnail(manifest, json.loads(manifest.read_text("utf-8"))))
+        pictures[name] = picture[:, : 2 * thumbnails.CELL, :3].astype(int)
+        matte = picture[thumbnails.CELL // 2, -thumbnails.CELL // 2, :3].astype(int)
         assert np.abs(matte - pictures.setdefault("matte", matte)).max() <= 8, name
     for name, picture in pictures.items():
         # Godot's is sampled from the lat-long, not filtered over it.
@@ -319,10 +319,10 @@ def many(folder: Path, count: int) -> list[Result]:
         "whitefurnace": "0.1.0", "name": "env", "key": KEY, "levels": rows, "irradiance": rows[0],
         "recipe": {"for": ["raw"]}, "device": {"name": "a", "platform": "b", "driver": "c"}, "files": {},
         "source": {"layout": "latlong", "statistics": {"width": 8, "height": 4, "brightest_share": 0.25}}}))
-    strips.write_strip(folder / "x.png", ([np.ones((6, 4, 4, 3), np.float32)], np.ones((strips.normals().shape[1], 3)),
-                                          strips.WORLD))
+    thumbnails.write_thumbnail(folder / "x.png", ([np.ones((6, 4, 4, 3), np.float32)],
+                                                  np.ones((thumbnails.normals().shape[1], 3)), thumbnails.WORLD))
     (folder / "strips").mkdir()
-    (folder / "x.png").rename(folder / "strips" / f"{KEY[:32]}-{strips.LOOK}.png")
+    (folder / "x.png").rename(folder / "strips" / f"{KEY[:32]}-{thumbnails.LOOK}.png")
     return [Result(k, "bake", f"bake[0]: probes/env {k:02d}.exr", f"env {k}", "done" if k % 3 else "skipped", "out",
                    str(manifest), {"compute": float(k * 7919 % 101)}, 1000 + k * 104729 % 5003) for k in range(count)]
 
@@ -343,7 +343,7 @@ def test_it_sorts_and_finds_in_a_browser(chromium, tmp_path, monkeypatch, most):
     about = browser.rendered("gallery", [], tmp_path, tmp_path).about
     names = [result.name for result in results]
     assert about["first"] == {"names": names, "sorts": [None] * 8, "said": ""}
-    assert about["focusable"] and about["images"] == [[strips.CELL * 4, strips.CELL]] * 30
+    assert about["focusable"] and about["images"] == [[thumbnails.CELL * 4, thumbnails.CELL]] * 30
     up, down = about["sorted"]["Environment"]
     assert up["names"] == names and down["names"] == names[::-1]  # env 2 before env 10
     assert up["sorts"] == ["ascending", *[None] * 7] and down["sorts"] == ["descending", *[None] * 7]

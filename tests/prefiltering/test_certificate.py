@@ -59,7 +59,7 @@ def test_texel_errors() -> None:
 
 def test_a_statement_by_hand() -> None:
     """300 uniform texels with errors .001 … .300 and two near a sun: `error` is the largest of the uniform, `worst`
-    that of all, `rmse` weighs each by its solid angle, those outside the stratum for all there are."""
+    that of all, `rmse` weighs each by its solid angle, those outside the near-source sample for all there are."""
     reference, error = np.ones((302, 3)), np.concatenate([np.arange(1, 301) / 1e3, [0.7, 0.5]])
     values, omega = reference + error[:, None], np.linspace(1, 2, 302)
     sample, total = (np.arange(300), np.array([5000, 5001])), 6002

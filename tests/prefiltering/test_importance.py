@@ -273,6 +273,7 @@ def test_suns_are_not_clamped(device: Device) -> None:
 # ---------------------------------------------------------------------------------------------- lanes and precision
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("lanes", [1, 4, 16])
 def test_every_width_gives_the_same(device: Device, monkeypatch: pytest.MonkeyPatch, lanes: int) -> None:
     texels = noise(16, 32)

@@ -267,7 +267,7 @@ def test_harmonics_of_a_harmonic(device: Device, source: tuple[int, ...], which:
 # ---------------------------------------------------------------------------------------------- lanes
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("alpha", [0.04, 0.2, 1.0])
 @pytest.mark.parametrize("lanes", [1, 4, 16])
 def test_every_width_gives_the_same(device: Device, monkeypatch: pytest.MonkeyPatch, lanes: int,

@@ -159,7 +159,7 @@ def texel_moments(texels: np.ndarray, rotation: float) -> np.ndarray:
 SOURCES = [(32, 64), (37, 74), (15, 30), (9, 18), (1, 2), (6, 16, 16), (6, 5, 5), (6, 1, 1)]
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("source", SOURCES, ids=str)
 def test_nodes_keep_the_moments(device: Device, source: tuple[int, ...]) -> None:
     """All of it: the clipped texels and the excess of the bright ones."""

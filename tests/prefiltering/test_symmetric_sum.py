@@ -179,6 +179,7 @@ def test_every_way_to_part_a_lobe(device: Device, parts: str, shape: Shape, prec
     assert_level(level, shape, want, index, FLOAT32 if precision == 32 else FLOAT64, (parts, shape, precision))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("shape", [Shape(False, 16), Shape(True, 8)], ids=str)
 def test_what_is_skipped_is_beyond_reach(device: Device, shape: Shape) -> None:
     """Of a lobe that is as heavy where its window begins to end as at its middle, nothing within the window is left
@@ -198,6 +199,7 @@ def test_what_is_skipped_is_beyond_reach(device: Device, shape: Shape) -> None:
         assert (error <= 0.51 * np.spacing(want.astype(np.float32))).all(), (shape, q1, error.max())
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", [n for n, m in models("ndf").items() if m.isotropic and m.from_roughness])
 def test_every_ndf(device: Device, name: str) -> None:
     entry, shape = models("ndf")[name], Shape(False, 16)
@@ -211,7 +213,7 @@ def test_every_ndf(device: Device, name: str) -> None:
     assert_level(level, shape, want, index, FLOAT32 + 50 * 3e-7, name)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("lanes", [1, 4, 16])
 @pytest.mark.parametrize("shape", [Shape(False, 4), Shape(False, 33), Shape(True, 4)], ids=str)
 def test_every_width(device: Device, monkeypatch: pytest.MonkeyPatch, shape: Shape, lanes: int) -> None:

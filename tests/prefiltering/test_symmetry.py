@@ -81,6 +81,7 @@ def test_there_are_24_rotations_and_turning_is_what_it_says():
     np.testing.assert_array_equal(turned(cube, turn)[4], cube[0])
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("matrix", [*ROTATIONS, *MIRRORS], ids=name)
 def test_a_cube_that_is_turned(matrix):
     values = prefilter(turned(noise(), matrix), **SIZES).values

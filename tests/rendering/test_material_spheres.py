@@ -16,7 +16,7 @@ from whitefurnace.errors import InputError, UsageError
 from whitefurnace.files import read_stored, write_exr
 from whitefurnace.rendering import shading as rendering
 from whitefurnace.rendering import side_by_side as beside
-from whitefurnace.scenes import material_spheres as swatches
+from whitefurnace.scenes import material_spheres
 
 pytest.importorskip("pygltflib")
 
@@ -96,8 +96,9 @@ def test_a_texture_counts_with_its_mean(tmp_path):
     image[:4] = 255
     textured = {"pbrMetallicRoughness": {"roughnessFactor": 0.8, "metallicFactor": 0.5,
                                          "metallicRoughnessTexture": {"index": 0}, "baseColorTexture": {"index": 0}}}
-    found = swatches.of_scene(swatches.read_scene(scene(tmp_path / "s.gltf", [textured, plain(0.3, 1)], [image])))
-    one, other = found.swatches
+    path = scene(tmp_path / "s.gltf", [textured, plain(0.3, 1)], [image])
+    found = material_spheres.of_scene(material_spheres.read_scene(path))
+    one, other = found.spheres
     assert one.roughness == pytest.approx(0.4) and one.metalness == pytest.approx(0.25)
     assert one.base_color == pytest.approx((0.5,) * 3)
     assert (other.roughness, other.metalness, other.base_color, other.insulator) == (0.3, 1, GOLD, (0.04,) * 3)
@@ -117,7 +118,7 @@ def test_what_is_left_out_is_said(tmp_path):
                   {**plain(0.5, 0), "emissiveFactor": [1, 1, 1]},
                   plain(0.5, 0, transmission={"transmissionFactor": 1}, volume={"thicknessFactor": 1}),
                   plain(0.5, 0, fur={})]
-    found = swatches.of_scene(swatches.read_scene(scene(tmp_path / "s.gltf", materials)))
+    found = material_spheres.of_scene(material_spheres.read_scene(scene(tmp_path / "s.gltf", materials)))
     said = {}
     for notice in found.notices:
         who, _, what = notice.partition(": ")
@@ -128,8 +129,8 @@ def test_what_is_left_out_is_said(tmp_path):
              "unlit, no sphere is drawn of it": "m9",
              "KHR_materials_fur is not read, what it falls back to is drawn": "m12"}
     assert said == want
-    assert [one.name for one in found.swatches] == [f"m{k}" for k in range(13) if k != 9]
-    assert found.swatches[6].insulator == pytest.approx((0.02,) * 3)
+    assert [one.name for one in found.spheres] == [f"m{k}" for k in range(13) if k != 9]
+    assert found.spheres[6].insulator == pytest.approx((0.02,) * 3)
 
 
 def test_more_than_64_are_those_of_most_primitives(tmp_path):
@@ -139,9 +140,9 @@ def test_more_than_64_are_those_of_most_primitives(tmp_path):
     primitives = doc["meshes"][0]["primitives"]
     often = [*range(0, 35, 7), 69]
     primitives += [dict(primitives[k]) for k in (*often, 69)]
-    found = swatches.of_scene(swatches.read_scene(written(tmp_path / "s.gltf", doc)), columns=10)
+    found = material_spheres.of_scene(material_spheres.read_scene(written(tmp_path / "s.gltf", doc)), columns=10)
     kept = sorted({*often, *[k for k in range(70) if k not in often][:58]})
-    assert [one.name for one in found.swatches] == [f"m{k}" for k in kept]
+    assert [one.name for one in found.spheres] == [f"m{k}" for k in kept]
     assert (found.rows, found.columns) == (7, 10) and "70 materials" in found.notices[0]
     assert found.placed()[-1] == {**found.placed()[-1], "name": "m69", "row": 7, "column": 4}
 

@@ -111,6 +111,7 @@ def test_constant_light_gives_the_albedo(device: Device):
     assert np.abs(E - want).max() < 2e-6
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("alpha", [0.1, 0.4, 1.0])
 def test_the_integral_by_hand(device: Device, alpha: float):
     """Of 32 × 64 texels, a third of them bright, against a sum over 1 024 × 2 048 directions in float64; lights are a

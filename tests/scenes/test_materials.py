@@ -323,6 +323,7 @@ def test_every_engine_decides_about_every_scene(tmp_path):
             assert ("skybox" in found.without) == (bool(engine.holding("skybox")) and not background)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("engine", ["raw", "exr"])
 def test_what_surfaces_read_does_not_change(tmp_path, engine):
     """Of the usual bake and of what the scene needs, the levels that its roughness reads are the same under the same
@@ -647,7 +648,8 @@ def replaced(doc: dict[str, Any], rng: random.Random) -> dict[str, Any]:
     return doc
 
 
-def test_anything_at_all_is_read_or_refused(tmp_path):
+@pytest.mark.parametrize("count", [150, pytest.param(600, marks=pytest.mark.long)])
+def test_anything_at_all_is_read_or_refused(tmp_path, count):
     rng = random.Random(5)
     extensions = {f"KHR_materials_{row[1]}": {row[2]: 0.5 if len(row[4]) == 1 else [0.5] * 3, row[3]: {"index": 0}}
                   for row in SPECIFIED if row[1] not in ("", "pbr")}
@@ -660,7 +662,7 @@ def test_anything_at_all_is_read_or_refused(tmp_path):
     whole = as_glb(tmp_path / "whole.glb", doc).read_bytes()
     refused, file = 0, tmp_path / "s.glb"
     tracemalloc.start()
-    for k in range(600):
+    for k in range(count):
         if k % 2:
             file.write_bytes(mutated(whole, rng))
         else:
@@ -675,7 +677,7 @@ def test_anything_at_all_is_read_or_refused(tmp_path):
             assert isinstance(error, InputError | UnsupportedError | FileError)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert refused > 200 and peak < 100e6, (refused, peak)  # the file itself is 10 kB
+    assert refused > count / 3 and peak < 100e6, (refused, peak)  # the file itself is 10 kB
 
 
 # ------------------------------------------------------------------------------------------------- others' files

@@ -10,7 +10,7 @@ import pytest
 import reference
 from whitefurnace.catalogue.subsurface import beyond, within
 from whitefurnace.errors import UsageError
-from whitefurnace.scenes.scale import MEDIA, UNITS, Medium, difference, footprint, judge, length, medium, told
+from whitefurnace.scenes.scale import MEDIA, UNITS, Medium, difference, footprint, judge, length, length_text, medium
 
 REFLECTANCE = {  # [Jensen2001, figure 5]
     "apple": (0.85, 0.84, 0.53), "chicken1": (0.31, 0.15, 0.10), "chicken2": (0.32, 0.16, 0.10),
@@ -26,7 +26,7 @@ def test_lengths_and_pixels() -> None:
     assert length("0.5mm") == pytest.approx(5e-4, rel=1e-15) and length(" 2 µm ") == pytest.approx(2e-6, rel=1e-15)
     assert length("1e-3 km") == pytest.approx(1.0) and length("3in") == pytest.approx(0.0762)
     for metres in (3e-9, 4.2e-6, 7.7e-4, 0.5, 12.0, 950.0, 1547e3):
-        assert length(told(metres)) == pytest.approx(metres, rel=0.05)  # two digits
+        assert length(length_text(metres)) == pytest.approx(metres, rel=0.05)  # two digits
     # A right angle over 1000 rows shows 2 m at 1 m; 2 ymag metres whatever the distance.
     assert footprint(1000, yfov=math.pi / 2, distance=1.0) == pytest.approx(2e-3, rel=1e-14)
     assert footprint(500, ymag=0.25) == pytest.approx(1e-3, rel=1e-14)
@@ -140,15 +140,15 @@ def test_a_mediums_lengths() -> None:
 def test_a_volume_of_gltf() -> None:
     one = Medium.of_volume(0.02, (0.5, 1.0, 0.0))
     assert one.absorption == pytest.approx((math.log(2) / 0.02, 0.0, math.inf))
-    told = judge(one, 0.04, 1e-3)
-    assert told.absorption is not None and told.transport is not None
-    assert told.absorption.transmittance == pytest.approx((0.25, 1.0, 0.0)) and told.absorption.verdict == "matters"
-    assert told.absorption.half == pytest.approx((0.02, math.inf, 0.0)) and told.transport.verdict == "clear"
+    found = judge(one, 0.04, 1e-3)
+    assert found.absorption is not None and found.transport is not None
+    assert found.absorption.transmittance == pytest.approx((0.25, 1.0, 0.0)) and found.absorption.verdict == "matters"
+    assert found.absorption.half == pytest.approx((0.02, math.inf, 0.0)) and found.transport.verdict == "clear"
     assert Medium.of_volume(None, (0.5, 0.5, 0.5)).absorption == Medium.of_volume().absorption == (0, 0, 0)
     black = judge(Medium.of_volume(1e-3, (0, 0, 0), scattering=(1.0, 1.0, 1.0)), 1.0, 1e-3)
     assert black.absorption is not None and black.absorption.verdict == "opaque"
     assert black.transport is not None and black.transport.verdict == "clear"  # what scatters is absorbed
-    assert json.loads(json.dumps(told.data(), allow_nan=False))["absorption"]["half"][1] is None
+    assert json.loads(json.dumps(found.data(), allow_nan=False))["absorption"]["half"][1] is None
 
 
 def test_what_is_noticed() -> None:
@@ -186,12 +186,12 @@ def test_what_is_noticed() -> None:
     ("wholemilk", "0.1mm", "0.01mm", "negligible", "cloudy"),
 ])
 def test_the_slides_examples(name: str, size: str, pixel: str, absorption: str, transport: str) -> None:
-    told = judge(medium(name), length(size), length(pixel))
-    assert told.absorption is not None and told.transport is not None
-    assert (told.absorption.verdict, told.transport.verdict) == (absorption, transport), told.sentences
-    assert told.subsurface == (transport in ("subsurface", "translucent")) and len(told.sentences) == 2
-    assert all(len(sentence) < 200 and "nan" not in sentence for sentence in told.sentences)
-    json.dumps(told.data(), allow_nan=False)
+    found = judge(medium(name), length(size), length(pixel))
+    assert found.absorption is not None and found.transport is not None
+    assert (found.absorption.verdict, found.transport.verdict) == (absorption, transport), found.sentences
+    assert found.subsurface == (transport in ("subsurface", "translucent")) and len(found.sentences) == 2
+    assert all(len(sentence) < 200 and "nan" not in sentence for sentence in found.sentences)
+    json.dumps(found.data(), allow_nan=False)
 
 
 def test_the_verdict_turns_where_95_percent_stay_within_a_pixel() -> None:

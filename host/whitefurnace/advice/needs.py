@@ -349,23 +349,23 @@ class _Deciding:
 
     def _effects(self) -> None:
         """What materials have that no table of an environment gives."""
-        def told(what: str, which: Sequence[Material], reason: str) -> None:
+        def add(what: str, which: Sequence[Material], reason: str) -> None:
             if which:
                 self.rows.append(Need(what, "effect", None, f"{_some([m.name for m in which])}: {reason}"))
 
-        told("iridescence", [m for m in self.lit if m["iridescence"].most > 0],
-             "its Fresnel term turns with the angle and the film, the split sum is of Schlick's with F90 = 1: an "
-             "average F0 is all that it can be given")
+        add("iridescence", [m for m in self.lit if m["iridescence"].most > 0],
+            "its Fresnel term turns with the angle and the film, the split sum is of Schlick's with F90 = 1: an "
+            "average F0 is all that it can be given")
         thick = [m for m in self.lit if m["transmission"].most > 0 and m["thickness"].most > 0]
-        told("refraction with volume", thick, "where light leaves depends on the shape, no table of an environment "
-             "holds that; engines read the chain, or the picture behind, along one refracted ray")
-        told("absorption", [m for m in thick if math.isfinite(m["attenuation_distance"].least)],
-             "Beer's law along that ray, in the shader: no table")
-        told("dispersion", [m for m in self.lit if m["dispersion"].most > 0], "one refracted ray a colour: no table")
-        told("anisotropy", [m for m in self.lit if m["anisotropy"].most > 0],
-             "only isotropic lobes can be prefiltered: engines read that of r along a bent direction")
+        add("refraction with volume", thick, "where light leaves depends on the shape, no table of an environment "
+            "holds that; engines read the chain, or the picture behind, along one refracted ray")
+        add("absorption", [m for m in thick if math.isfinite(m["attenuation_distance"].least)],
+            "Beer's law along that ray, in the shader: no table")
+        add("dispersion", [m for m in self.lit if m["dispersion"].most > 0], "one refracted ray a colour: no table")
+        add("anisotropy", [m for m in self.lit if m["anisotropy"].most > 0],
+            "only isotropic lobes can be prefiltered: engines read that of r along a bent direction")
         strong = [m for m in self.scene.materials if m["emission"].most * m["emissive_strength"].most > 1]
-        told("light of its own", strong, "it is seen, and lights nothing else: it is not in the environment")
+        add("light of its own", strong, "it is seen, and lights nothing else: it is not in the environment")
         for m in self.lit:
             for name in m.unread:
                 self.rows.append(Need(name, "effect", None, f"{m.name}: this extension is not read, its fallback is"))

@@ -19,7 +19,7 @@ from whitefurnace.baking.bake import format_notices
 from whitefurnace.batch.jobs import Result
 from whitefurnace.errors import FileError, WhitefurnaceError
 from whitefurnace.files import read_manifest, write_atomic
-from whitefurnace.rendering.thumbnails import CELL, LOOK, read_strip, write_strip
+from whitefurnace.rendering.thumbnails import CELL, LOOK, read_thumbnail, write_thumbnail
 from whitefurnace.text import size as bytes_text
 
 INDEX, STRIPS = "index.html", "strips"
@@ -197,11 +197,11 @@ class Gallery:
         path = self.folder / STRIPS / name
         if not path.is_file():
             try:
-                read = read_strip(Path(result.manifest), told)
+                read = read_thumbnail(Path(result.manifest), told)
             except WhitefurnaceError as error:
                 return f'<span class="small none">no picture: <bdi>{_text(str(error))}</bdi></span>'
             path.parent.mkdir(parents=True, exist_ok=True)
-            write_strip(path, read)
+            write_thumbnail(path, read)
         self._strips.add(name)
         width, height = _dimensions(path)
         spheres = width // CELL - 3

@@ -187,7 +187,7 @@ def _enough(device: Device, make: Callable[[int], Work], least: float) -> Work:
     return work
 
 
-class Meter:
+class BenchMeter:
     """The yardsticks of a device. Each call is one run; what all of them gave is in `yardstick`."""
 
     def __init__(self, device: Device, least: float = LEAST_SECONDS, nbytes: int = STREAM_BYTES) -> None:
@@ -597,7 +597,7 @@ def cases(names: Sequence[str]) -> tuple[Case, ...]:
     return tuple(known[name] for name in dict.fromkeys(names)) if names else CASES
 
 
-def throughput(wanted: Sequence[Case], device: Device, meter: Meter, runs: int = RUNS,
+def throughput(wanted: Sequence[Case], device: Device, meter: BenchMeter, runs: int = RUNS,
                progress: Callable[[str, float], None] | None = None) -> Iterator[Throughput]:
     """Measures cases one after the other, in every precision the device has, each with its yardstick beside it."""
     todo = [(case, precision) for case in wanted for precision in case.precisions if precision in meter.precisions]

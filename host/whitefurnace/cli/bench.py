@@ -77,7 +77,7 @@ def bench(words: tuple[str, ...], runs: int | None, size: int | None, min_size: 
             click.echo(cases_text(cases, benching.FLOPS))
         return
     on = choose_device(device)
-    meter = benching.Meter(on)
+    meter = benching.BenchMeter(on)
     rows = []
     with progress(not as_json) as report:
         for row in benching.throughput(cases, on, meter, runs or benching.RUNS, of_one(report, "bench")):

@@ -86,18 +86,18 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
     shape = grid.shape if components == 1 else (*grid.shape, components)
     values = room_for(shape, precision, out)
     flat = values.reshape(grid.size, components)
-    tally = Tally()
+    totals = Totals()
     for begin in range(0, grid.size, CELLS_A_LAUNCH):
         end = min(begin + CELLS_A_LAUNCH, grid.size)
-        total = sum(_average(part, grid, begin, end, tolerance, tally) if entry.name == "albedo_average" else
-                    _at_grazing(part, grid.rows(part, begin, end), tolerance, tally) for part in parts)
+        total = sum(_average(part, grid, begin, end, tolerance, totals) if entry.name == "albedo_average" else
+                    _at_grazing(part, grid.rows(part, begin, end), tolerance, totals) for part in parts)
         flat[begin:end] = np.asarray(total).T
         if progress:
             progress(end / grid.size)
-    error = tally.error * len(parts)
-    return Integrated(values, error, tally.evaluations, time.perf_counter() - start,
-                      tally.rule.name if tally.rule else "",
-                      (*tally.notices(), *missed(error, tolerance, precision), *_of_files(parts, flat)))
+    error = totals.error * len(parts)
+    return Integrated(values, error, totals.evaluations, time.perf_counter() - start,
+                      totals.rule.name if totals.rule else "",
+                      (*totals.notices(), *missed(error, tolerance, precision), *_of_files(parts, flat)))
 
 
 def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
@@ -398,8 +398,9 @@ def parts_of(device: Device, entry: Integral, slots: Mapping[str, Chosen], preci
 
 
 @dataclass
-class Tally:
-    """What a run has cost and how far it is from the truth."""
+class Totals:
+    """Totals of a run: its largest estimated error, its evaluations of the integrand, the finest rule that it used, and
+    the number of cells promoted to float64."""
 
     error: float = 0.0
     evaluations: int = 0
@@ -417,7 +418,7 @@ class Tally:
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
-def climb(part: Part, rows: np.ndarray, tolerance: float, tally: Tally, precision: int | None = None) -> np.ndarray:
+def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precision: int | None = None) -> np.ndarray:
     """(components, n): climbs the ladder, every block of cells until two neighbouring rules agree on it."""
     precision = precision or part.precision
     ladder = part.ladder
@@ -426,14 +427,14 @@ def climb(part: Part, rows: np.ndarray, tolerance: float, tally: Tally, precisio
     # A coarse tolerance starts low, a tight one where the tables of the rules say it can end.
     first = 0 if tolerance >= 1e-3 else 1 if tolerance >= 1e-5 else 3 if tolerance >= 1e-8 else 5
     values = part.sum(cells, terms, ladder[first], precision).astype(np.float64)
-    tally.used(ladder[first], part.lanes(cells))
+    totals.used(ladder[first], part.lanes(cells))
     active = np.arange(n)
     change = np.empty(0)
     slow = max(m.facts.get("slow rules", 1.0) for m in part.slots.values())
     before = np.where(np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) < BLOCK, np.inf, 0.0)
     for rule in ladder[first + 1:]:
         fine = part.sum(cells[:, active], terms, rule, precision).astype(np.float64)
-        tally.used(rule, part.lanes(cells[:, active]))
+        totals.used(rule, part.lanes(cells[:, active]))
         starts = np.arange(0, active.size, BLOCK)
         step = slow * np.maximum.reduceat(np.abs(fine - values[:, active]).max(0), starts)
         change, before = np.maximum(step, before / LUCK), step
@@ -443,7 +444,7 @@ def climb(part: Part, rows: np.ndarray, tolerance: float, tally: Tally, precisio
         allowed = np.maximum(tolerance - rounding, rounding)
         open_ = ~(change <= allowed)
         done = float(np.max((change + rounding + floor * size)[~open_], initial=0.0))
-        tally.error = max(tally.error, done)
+        totals.error = max(totals.error, done)
         keep = np.repeat(open_, BLOCK)[:active.size]
         change, before, rounding = change[open_], before[open_], (rounding + floor * size)[open_]
         active = active[keep]
@@ -451,14 +452,14 @@ def climb(part: Part, rows: np.ndarray, tolerance: float, tally: Tally, precisio
             break
     if active.size and precision == 32 and part.device.fp64:
         # Whole ladders end within float32's reach or stop at its rounding: float64 goes on from here.
-        tally.promoted += active.size
-        values[:, active] = climb(part, rows[:, active], tolerance, tally, 64)
+        totals.promoted += active.size
+        values[:, active] = climb(part, rows[:, active], tolerance, totals, 64)
     elif active.size:
         left = float(np.max(max(UNFINISHED / slow, 1) * change + rounding))
         if not np.isfinite(left):
             raise CheckError(f"integral {part.entry.name} is not finite for some of these parameters in "
                              f"float{precision}{_example(part, rows, values)}")
-        tally.error = max(tally.error, left)
+        totals.error = max(totals.error, left)
     return values
 
 
@@ -471,30 +472,30 @@ def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
     return ": " + ", ".join(f"{name} = {value:g}" for name, value in zip(names, rows[:, bad[0]], strict=True))
 
 
-def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, tally: Tally) -> np.ndarray:
+def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, totals: Totals) -> np.ndarray:
     """`climb`, by a kernel of its own where there is one for these models, and infinity where a diffuse albedo is
     infinite at n·v = 0, as its closed form says (Minnaert's)."""
     own_kernel, far = own_kernel_of(part.entry, part.slots), rows[0] >= CLOSED_FROM[0]
     if own_kernel and tolerance >= CLOSED_FROM[1] and far.any():
         values = np.empty((part.components, rows.shape[1]))
-        values[:, far] = climb(replace(part, closed=own_kernel), rows[:, far], tolerance, tally)
+        values[:, far] = climb(replace(part, closed=own_kernel), rows[:, far], tolerance, totals)
         if not far.all():
-            values[:, ~far] = climb(part, rows[:, ~far], tolerance, tally)
+            values[:, ~far] = climb(part, rows[:, ~far], tolerance, totals)
         return values
     along = np.flatnonzero(rows[0] == 0) if "diffuse" in part.slots else np.empty(0, int)
     closed = part.slots["diffuse"].reference.get("albedo") if along.size else None
     if closed is None:
-        return climb(part, rows, tolerance, tally)
+        return climb(part, rows, tolerance, totals)
     own = {p.name: rows[1 + k, along] for k, p in enumerate(part.slots["diffuse"].parameters)}
     with np.errstate(all="ignore"):
         infinite = along[np.isinf(closed(rows[0, along], **own))]
     rows[0, infinite] = 1  # any view that has an answer
-    values = climb(part, rows, tolerance, tally)
+    values = climb(part, rows, tolerance, totals)
     values[:, infinite] = np.inf
     return values
 
 
-def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, tally: Tally) -> np.ndarray:
+def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, totals: Totals) -> np.ndarray:
     """(components, n): 2∫ E(μ) μ dμ with μ = x² (the grazing end wants nodes), by rules of more and more nodes."""
     out = np.empty((part.components, end - begin))
     for some in _slices(begin, end, 512):
@@ -505,18 +506,18 @@ def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, tal
             x, w = gauss(count)
             many = np.repeat(rows, count, 1)
             many[0] = np.tile(x * x, rows.shape[1])
-            inner = Tally()
+            inner = Totals()
             E = climb(part, many, tolerance / 2, inner).reshape(part.components, rows.shape[1], count)
-            tally.evaluations += inner.evaluations
-            tally.promoted += inner.promoted
-            tally.rule = inner.rule
+            totals.evaluations += inner.evaluations
+            totals.promoted += inner.promoted
+            totals.rule = inner.rule
             value = E @ (4 * w * x**3)
             step = np.inf if before is None else float(np.abs(value - before).max())
             change, last = max(step, last), step if before is not None else last
             before = value
             if change + inner.error <= max(tolerance, 2 * inner.error):
                 break
-        tally.error = max(tally.error, change + inner.error)
+        totals.error = max(totals.error, change + inner.error)
         out[:, some[0] - begin:some[1] - begin] = value
     return out
 

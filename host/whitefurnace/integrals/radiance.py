@@ -22,7 +22,7 @@ from whitefurnace.integrals.quadrature import (
     Part,
     Progress,
     TableSpec,
-    Tally,
+    Totals,
     climb,
     grid_of,
     parts_of,
@@ -165,7 +165,7 @@ class _Task:
     precision: int
     tolerance: float
     progress: Progress | None
-    tally: Tally = field(default_factory=Tally)
+    totals: Totals = field(default_factory=Totals)
     rule: str = ""
     errors: dict[str, float] = field(default_factory=dict)  # by summand
     closed: int = 0  # evaluations of closed forms
@@ -189,11 +189,11 @@ class _Task:
         self.errors[summand] = max(self.errors.get(summand, 0.0), error)
 
     def result(self, values: np.ndarray, start: float) -> Integrated:
-        rule = self.tally.rule.name if self.tally.rule else self.rule
+        rule = self.totals.rule.name if self.totals.rule else self.rule
         # What is left of float32 is the rounding of the values themselves.
         rounding = float(np.abs(values).max()) * (6e-8 if self.precision == 32 else 1e-15)
-        return Integrated(values, sum(self.errors.values()) + rounding, self.tally.evaluations + self.closed,
-                          time.perf_counter() - start, rule, self.tally.notices())
+        return Integrated(values, sum(self.errors.values()) + rounding, self.totals.evaluations + self.closed,
+                          time.perf_counter() - start, rule, self.totals.notices())
 
 
 # ---------------------------------------------------------------------------------------------- closed forms
@@ -277,8 +277,8 @@ def _albedo(task: _Task, begin: int, end: int) -> tuple[np.ndarray, float]:
         brdf = {slot: c for slot, c in task.slots.items() if slot != "light"}
         task.parts["albedo"] = parts_of(task.device, integral("albedo"), brdf, task.precision)
     parts = task.parts["albedo"]
-    total = sum(climb(part, task.grid.rows(part, begin, end), task.tolerance, task.tally) for part in parts)
-    return np.asarray(total), task.tally.error * len(parts)
+    total = sum(climb(part, task.grid.rows(part, begin, end), task.tolerance, task.totals) for part in parts)
+    return np.asarray(total), task.totals.error * len(parts)
 
 
 def _widths(task: _Task, slots: Mapping[str, Model], begin: int, end: int) -> np.ndarray:
@@ -382,7 +382,7 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
         names = [*part.view[:-1], *(f"{slot}_{p.name}" for slot, m in part.slots.items() for p in m.parameters)]
         rows = np.stack([task.column(name, begin, end) for name in names])
         rows = np.insert(rows, len(part.view) - 1, np.arange(end - begin), 0)
-        tally = Tally()
+        totals = Totals()
         NoV = task.column("NoV", begin, end)
         sharp = np.zeros(end - begin, bool)
         if task.precision == 32 and task.device.fp64:
@@ -390,14 +390,14 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
         values = np.empty((part.components, end - begin))
         for some, precision in ((~sharp, task.precision), (sharp, 64)):
             if some.any():
-                values[:, some] = climb(part, rows[:, some], task.tolerance, tally, precision)
-                tally.error += float(_blur(part.widths[some], NoV[some], precision).max())
-        tally.promoted += int(sharp.sum())
-        error += tally.error + part.largest
-        task.tally.evaluations += tally.evaluations
-        task.tally.promoted += tally.promoted
-        if tally.rule and (task.tally.rule is None or tally.rule.evaluations > task.tally.rule.evaluations):
-            task.tally.rule = tally.rule
+                values[:, some] = climb(part, rows[:, some], task.tolerance, totals, precision)
+                totals.error += float(_blur(part.widths[some], NoV[some], precision).max())
+        totals.promoted += int(sharp.sum())
+        error += totals.error + part.largest
+        task.totals.evaluations += totals.evaluations
+        task.totals.promoted += totals.promoted
+        if totals.rule and (task.totals.rule is None or totals.rule.evaluations > task.totals.rule.evaluations):
+            task.totals.rule = totals.rule
         total = total + values
     task.state("area", error * float(light["radiance"].max()))
     return total * light["radiance"]
@@ -664,7 +664,7 @@ class _Texels:
             E, error = _albedo(task, begin, end)
             total += E * self.base[:, None]
             task.state("albedo", error * float(self.base.max()) / self.scale)
-            task.rule = task.tally.rule.name if task.tally.rule else ""
+            task.rule = task.totals.rule.name if task.totals.rule else ""
         if self.rest.any():
             task.rule, rest = self._rest(begin, end)
             total += rest
@@ -684,7 +684,7 @@ class _Texels:
             if not len(index):
                 continue
             if precision > task.precision:
-                task.tally.promoted += len(index)
+                task.totals.promoted += len(index)
             cells, terms, table = self.whole.cells(rows[:, index], precision)
             alone = "ndf" in task.models or "brdf" in task.models
             # Diffuse models see every texel alike and go together; a lobe has its own close texels for each view.
@@ -695,11 +695,11 @@ class _Texels:
                 cuts = 1
                 while True:
                     value = self.far(group, terms, cuts, precision, skip if skip is not None and skip.any() else None)
-                    task.tally.evaluations += self.faces * self.rows * self.columns * cuts**2 * len(some)
+                    task.totals.evaluations += self.faces * self.rows * self.columns * cuts**2 * len(some)
                     if len(parts):
                         edge = 2 + 2 * cuts
                         value += self.near(group, terms, parts, edge, precision)
-                        task.tally.evaluations += len(parts) * edge**2
+                        task.totals.evaluations += len(parts) * edge**2
                     change = np.inf if before is None else float(np.abs(value - before).max())
                     before = value
                     most = max(most, cuts)

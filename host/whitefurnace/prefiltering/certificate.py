@@ -1,4 +1,4 @@
-"""The statement of a level from a sample of its texels: error, worst, rmse, as the README defines them."""
+"""Estimates the errors of a level from a sample of its texels: error, worst and rmse."""
 from __future__ import annotations
 
 import math
@@ -7,7 +7,10 @@ import numpy as np
 
 
 def texel_errors(values: np.ndarray, reference: np.ndarray, mean: float) -> np.ndarray:
-    """(m,): max over channels of |x - ref| / max(ref, 1e-3 · mean), 0/0 = 0. values, reference: (m, 3)."""
+    """Texel errors (m,): the maximum over channels of |x - ref| / max(ref, 1e-3 · mean), with 0/0 = 0.
+
+    values, reference: (m, 3) radiance. mean: mean radiance of the level.
+    """
     difference = np.abs(values - reference)
     floor = np.maximum(reference, 1e-3 * mean)
     return np.divide(difference, floor, out=np.zeros_like(difference, np.float64), where=floor > 0).max(1, initial=0.0)
@@ -15,11 +18,14 @@ def texel_errors(values: np.ndarray, reference: np.ndarray, mean: float) -> np.n
 
 def statement(values: np.ndarray, reference: np.ndarray, sample: tuple[np.ndarray, np.ndarray],
               solid_angle: np.ndarray, mean: float, total: int) -> tuple[float, float, float]:
-    """(error, worst, rmse) of a level from its sample.
+    """The stated (error, worst, rmse) of a level, from a sample of its texels.
 
-    sample: texel indices, a uniform draw and a stratum. values, reference: (m, 3) and solid_angle: (m,) of the
-    two in this order. In `rmse` the stratum stands for itself and the uniform texels outside it, by inverse
-    probability, for the rest.
+    `error` bounds the 99th percentile of the texel errors at 95 % confidence, by the uniform draw. `worst` is the
+    largest of all. In `rmse` the near-source texels count as they are, and the uniform texels outside them are weighted
+    by inverse probability for the rest of the level. All three are infinite where a texel error is not finite.
+
+    sample: texel indices, a uniform draw and the near-source sample. values, reference: (m, 3) radiance of the texels
+    of both, in this order; solid_angle: (m,) theirs. mean: mean radiance of the level. total: its number of texels.
     """
     reference = reference.astype(np.float64)
     errors = texel_errors(values, reference, mean)
@@ -40,9 +46,11 @@ QUANTILE, CONFIDENCE = 0.99, 0.95
 
 
 def rank(n: int) -> int:
-    """Which of n errors of uniform texels, the largest being 0, bounds the 99th percentile at 95 % confidence: that
-    many and fewer lie above the percentile with a probability of at most 5 % (order statistic). 0 for the least n,
-    299."""
+    """Index, from the largest down, of the error among those of n uniform texels that bounds the 99th percentile.
+
+    The bound holds at 95 % confidence: the probability that so few errors or fewer lie above the percentile is at most
+    5 % (order statistic). The index is 0, the largest error, for n = 299, the fewest texels that give a bound.
+    """
     # The logarithm, since .99^n is less than any float64 beyond 74 000.
     found, chance, below = -1, n * math.log(QUANTILE), 0.0
     while below + math.exp(chance) <= 1 - CONFIDENCE:

@@ -323,7 +323,11 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- statement
 
     def sample(self, shape: Shape, uniform_count: int = CERTIFIED) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the texels a certificate looks at: (uniform draw, stratum near the brightest sources)."""
+        """Indices of the texels of a certificate: (uniform draw, near-source sample).
+
+        The near-source sample holds the texels nearest the brightest sources. It is empty where the level is so small
+        that all of its texels are drawn.
+        """
         if shape.count <= uniform_count + planning.NEAR_BRIGHT:
             return np.arange(shape.count), np.arange(0)
         digest = hashlib.sha256(f"{self.seed}/{self.environment.digest}/{shape}".encode()).digest()

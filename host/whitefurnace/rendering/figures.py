@@ -11,7 +11,7 @@ import numpy as np
 from whitefurnace.plot_style import colours_named, drawing
 
 
-def draw_beside(path: Path, pictures: Sequence[np.ndarray], difference: np.ndarray, scale: float, engine: str,
+def draw_side_by_side(path: Path, pictures: Sequence[np.ndarray], difference: np.ndarray, scale: float, engine: str,
                 caption: Sequence[str], stated: Mapping[str, str]) -> None:
     """Two pictures (h, w, 3) in [0, 1], the engine's and the truth, and the map (h, w) of what they differ by, NaN
     where it is of nothing, its colours from -scale to scale: pixel by pixel, one below the other where they are wide.

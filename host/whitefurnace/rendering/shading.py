@@ -28,7 +28,7 @@ from whitefurnace.files import (
 )
 from whitefurnace.files.texture import upright
 from whitefurnace.prefiltering.reading import bilinear
-from whitefurnace.scenes.material_spheres import DIELECTRIC, Laid, in_range, laid, of_grid
+from whitefurnace.scenes.material_spheres import DIELECTRIC, SphereLayout, in_range, layout_of, of_grid
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere import octahedral_map as octamap
 
@@ -290,8 +290,8 @@ def _read_everything(engine: Engine, folder: Path, stem: str) -> Lights:
         if not read:
             raise FileError(f"cannot read {path}: there is no such file")
         read += [folder / f"{stem}_irradiance.exr", folder / f"{stem}_dfg.exr"]
-        *strips, table = (read_stored(path) for path in read)
-        *levels_, cube = (strip[..., :3].reshape(-1, strip.shape[1], strip.shape[1], 3) for strip in strips)
+        *images, table = (read_stored(path) for path in read)
+        *levels_, cube = (image[..., :3].reshape(-1, image.shape[1], image.shape[1], 3) for image in images)
         levels = tuple(levels_)
     if not levels or any(t.ndim != 4 or t.shape[0] != 6 or t.shape[1] != t.shape[2] or t.shape[3] != 3
                          for t in (*levels, cube)) or table.ndim != 3 or table.shape[2] < 2:
@@ -320,8 +320,8 @@ def _maps(file: File, path: Path, manifest: Path) -> tuple[tuple[np.ndarray, ...
         return tuple(np.pad(texels, ((1, 1), (1, 1), (0, 0)), "edge") for texels in levels), 1
     image = read_stored(path)[..., :3]
     files = _listed(dictionary(read_manifest(manifest)))
-    told, b = dictionary(files.get(f"{path.parent.name}/{path.name}")).get("levels"), file.border
-    count = len(told) if isinstance(told, list) else 0
+    rows, b = dictionary(files.get(f"{path.parent.name}/{path.name}")).get("levels"), file.border
+    count = len(rows) if isinstance(rows, list) else 0
     # Level 0 and its border, and at its right, where there are more, level 1 and its own (octamap.atlas_places).
     size = image.shape[1] - 2 * b if count == 1 else (image.shape[1] - 4 * b) * 2 // 3
     try:
@@ -361,13 +361,13 @@ def engine_in(manifest: str | os.PathLike[str], name: str) -> tuple[Engine, Path
     engine = chosen[0]
     if engine.name not in names:
         raise UsageError(f"{path} was not baked for {name}; it has {', '.join(names)}")
-    for entry, told in listed.items():
+    for entry, stated in listed.items():
         if entry.split("/")[0] != engine.name:
             continue
         file = path.parent / entry
         if not file.is_file():
             raise FileError(f"cannot read {file}: {path} lists it and it is not there")
-        if digest_file(file) != dictionary(told).get("sha256"):
+        if digest_file(file) != dictionary(stated).get("sha256"):
             raise InputError(f"{file} is not the file that {path} lists: it was changed since the bake")
     return engine, path.parent / engine.name, found["name"]
 
@@ -434,7 +434,7 @@ def grid(engine: Engine, lights: Lights, *, columns: int = 7, rows: int = 3, siz
     return drawn(engine, lights, of_grid(columns, rows, base_color), size=size, background=background)
 
 
-def drawn(engine: Engine, lights: Lights, spheres: Laid, *, size: int = 128,
+def drawn(engine: Engine, lights: Lights, spheres: SphereLayout, *, size: int = 128,
           background: str = "environment") -> np.ndarray:
     """(rows · size, columns · size, 3) linear radiance of spheres row by row, as `grid`; where the last row has fewer,
     the rest is background."""
@@ -450,7 +450,7 @@ def drawn(engine: Engine, lights: Lights, spheres: Laid, *, size: int = 128,
     for i in range(rows):
         band = slice(i * size, (i + 1) * size)
         picture[band] = _behind(engine, lights, picture.shape, band) if background == "environment" else GREY
-        for j, of in enumerate(spheres.swatches[i * columns:(i + 1) * columns]):
+        for j, of in enumerate(spheres.spheres[i * columns:(i + 1) * columns]):
             cell = picture[band, j * size:(j + 1) * size].reshape(-1, 3)  # a copy
             lit = shade(engine, lights, n, v, of.base_color, of.metalness, of.roughness, np.asarray(of.insulator))
             cell[index] += (lit - cell[index]) * cover[:, None]
@@ -499,7 +499,7 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         raise FileError(f"{output} exists; --force replaces it")
     engine, folder, stem = engine_in(manifest, for_)
     lights = read_lights(engine, folder, stem)
-    spheres = laid(scene, columns, rows, base_color)
+    spheres = layout_of(scene, columns, rows, base_color)
     picture = drawn(engine, lights, spheres, size=size, background=background)
     write_png(output, srgb(picture * 2.0**exposure))
     return Rendered(output, engine.name, picture.shape[1], picture.shape[0], spheres.roughness, spheres.metalness,

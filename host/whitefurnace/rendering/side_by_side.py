@@ -25,7 +25,7 @@ from whitefurnace.prefiltering.reading import bilinear
 from whitefurnace.rendering import shading as rendering
 from whitefurnace.rendering.shading import Lights
 from whitefurnace.rendering.truth import Points, Term, Truth, albedo, term
-from whitefurnace.scenes.material_spheres import DIELECTRIC, Laid, Swatch, laid
+from whitefurnace.scenes.material_spheres import DIELECTRIC, MaterialSphere, SphereLayout, layout_of
 from whitefurnace.sphere.environments import Environment, environment
 from whitefurnace.sphere.grids import radiance_at
 from whitefurnace.sphere.suns import without_sun
@@ -158,7 +158,7 @@ class Spheres:
         self._diffuse: dict[Triple, np.ndarray] = {}
         self._diffuse_lit: dict[Triple, np.ndarray] = {}
 
-    def alike(self, roughness: float, swatches: Sequence[Swatch], tolerance: float,
+    def alike(self, roughness: float, spheres: Sequence[MaterialSphere], tolerance: float,
               ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
         """Of one roughness: for each swatch (m, 3) by the environment and (m, 3) by the further lights, the samples a
         point and the estimate of their error, and the terms."""
@@ -189,9 +189,9 @@ class Spheres:
             return np.asarray(once * (1 + F0 * lost[:, None]))
 
         pictures, extras = [], []
-        for swatch in swatches:
-            m, base = swatch.metalness, swatch.base_color
-            color, F0 = np.asarray(base, np.float64), np.asarray(swatch.insulator, np.float64)
+        for sphere in spheres:
+            m, base = sphere.metalness, sphere.base_color
+            color, F0 = np.asarray(base, np.float64), np.asarray(sphere.insulator, np.float64)
             rest = 1 - of("dielectric", F0, made, albedo=True)
             mixed = [(1 - m) * of("dielectric", F0, values) + m * of("metal", color, values) for values in (made, lit)]
             pictures.append(mixed[0] + (1 - m) * rest * self.diffuse(base))
@@ -276,20 +276,20 @@ def in_frame(light: Chosen, given: Mapping[str, float], points: Points) -> dict[
     and phi_l are a direction. Raises UsageError for a parameter that is missing.
     """
     model, m = light.model, points.n.shape[1]
-    told = {**{p.name: p.default for p in model.parameters if p.default is not None}, **given}
+    values = {**{p.name: p.default for p in model.parameters if p.default is not None}, **given}
     for p in model.parameters:
-        if p.name not in told:
+        if p.name not in values:
             raise UsageError(f"light {model.name} needs {p.name}, {p.about}")
     surface = points.surface()
     x, z = surface[3:6], points.n
     frame = np.stack([x, np.cross(z, x, axis=0), z])  # (3, 3, m)
-    placed = {name: np.full(m, float(value)) for name, value in told.items()}
-    for name in [n[:-2] for n in told if n.endswith("_x")]:
-        vector = np.array([told[f"{name}_{axis}"] for axis in "xyz"], np.float64)[:, None]
+    placed = {name: np.full(m, float(value)) for name, value in values.items()}
+    for name in [n[:-2] for n in values if n.endswith("_x")]:
+        vector = np.array([values[f"{name}_{axis}"] for axis in "xyz"], np.float64)[:, None]
         vector = vector - points.n if name == "center" else np.broadcast_to(vector, (3, m))
         placed |= {f"{name}_{axis}": (row * vector).sum(0) for axis, row in zip("xyz", frame, strict=True)}
-    if "NoL" in told and "phi_l" in told:
-        c, phi = float(told["NoL"]), float(told["phi_l"])
+    if "NoL" in values and "phi_l" in values:
+        c, phi = float(values["NoL"]), float(values["phi_l"])
         s = math.sqrt((1 - c) * (1 + c))
         to = (frame * np.array([s * math.cos(phi), s * math.sin(phi), c])[:, None]).sum(1)
         placed |= {"NoL": np.clip(to[2], -1.0, 1.0), "phi_l": np.arctan2(to[1], to[0])}
@@ -304,8 +304,8 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
 
     Raises InputError where its digest is not the one in the manifest, and what `environment` raises.
     """
-    told = rendering.dictionary(read_manifest(Path(manifest)))
-    recipe, source = rendering.dictionary(told.get("recipe")), rendering.dictionary(told.get("source"))
+    written = rendering.dictionary(read_manifest(Path(manifest)))
+    recipe, source = rendering.dictionary(written.get("recipe")), rendering.dictionary(written.get("source"))
     item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
     turn, exposure = recipe.get("rotate"), recipe.get("exposure")
     for name, value in (("rotate", turn), ("exposure", exposure)):
@@ -321,19 +321,20 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
 
 def ndf_of(manifest: str | os.PathLike[str]) -> Spec:
     """The NDF that a bake was filtered with. Raises UsageError for one from a file."""
-    told = rendering.dictionary(rendering.dictionary(read_manifest(Path(manifest))).get("recipe")).get("ndf", "ggx")
-    if isinstance(told, str):
-        return told
-    entry = rendering.dictionary(told)
+    ndf = rendering.dictionary(rendering.dictionary(read_manifest(Path(manifest))).get("recipe")).get("ndf", "ggx")
+    if isinstance(ndf, str):
+        return ndf
+    entry = rendering.dictionary(ndf)
     if "sha256" in entry or not isinstance(entry.get("name"), str):
         raise UsageError(f"{manifest} was filtered with an NDF from a file: give it as --ndf FILE.clh")
     given = {k: tuple(v) if isinstance(v, list) else v for k, v in entry.items() if k != "name"}
     return Chosen(chosen("ndf", entry["name"]).model, given)
 
 
-def panels(engine: Engine, lights: Lights, env: Environment, device: Device, material: Material, laid: Laid, *,
-           size: int = 128, background: str = "environment", tolerance: float = TOLERANCE, certify: int = 1,
-           further: Sequence[Spec] = (), progress: Callable[[str, float], None] | None = None) -> Shown:
+def panels(engine: Engine, lights: Lights, env: Environment, device: Device, material: Material,
+           layout: SphereLayout, *, size: int = 128, background: str = "environment", tolerance: float = TOLERANCE,
+           certify: int = 1, further: Sequence[Spec] = (),
+           progress: Callable[[str, float], None] | None = None) -> Shown:
     """The spheres of `rendering.drawn` as the engine shows them, in truth, and their difference. What is smoother than
     MIRROR is one in truth.
 
@@ -342,14 +343,14 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
     environment, which are added to both pictures alike. Raises as `rendering.drawn` does.
     """
     begin = time.perf_counter()
-    shown = rendering.drawn(engine, lights, laid, size=size, background=background)
+    shown = rendering.drawn(engine, lights, layout, size=size, background=background)
     clock = {"engine": time.perf_counter() - begin}
     index, cover, n = rendering.sphere(size)
     points = Points(n, np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape))
     truth = Truth(device, env)
     spheres = Spheres(truth, material, points, further)
     groups: dict[float, list[int]] = {}
-    for k, one in enumerate(laid.swatches):
+    for k, one in enumerate(layout.spheres):
         groups.setdefault(one.roughness if one.roughness >= MIRROR else 0.0, []).append(k)
     picture = np.full(shown.shape, rendering.GREY)
     if background == "environment":
@@ -359,12 +360,12 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
     clock |= {"truth": 0.0, "certificate": 0.0}
     for j, (roughness, those) in enumerate(groups.items()):
         begin = time.perf_counter()
-        true, extra, count, estimate, terms = spheres.alike(roughness, [laid.swatches[k] for k in those],
+        true, extra, count, estimate, terms = spheres.alike(roughness, [layout.spheres[k] for k in those],
                                                             tolerance)
         samples.append(count)
         estimates.append(estimate)
         for k, by_sky, by_lights in zip(those, true, extra, strict=True):
-            one, (i, across) = laid.swatches[k], divmod(k, laid.columns)
+            one, (i, across) = layout.spheres[k], divmod(k, layout.columns)
             where = np.s_[i * size:(i + 1) * size, across * size:(across + 1) * size]
             lit = rendering.shade(engine, lights, n, points.v, one.base_color, one.metalness, one.roughness,
                                   np.asarray(one.insulator))
@@ -447,7 +448,7 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         raise FileError(f"{output} exists; --force replaces it")
     if output.suffix.lower() == ".png":
         from whitefurnace import plot_style
-        from whitefurnace.rendering.figures import draw_beside
+        from whitefurnace.rendering.figures import draw_side_by_side
 
         plot_style.require()
     engine, folder, stem = rendering.engine_in(manifest, for_)
@@ -455,7 +456,7 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
     for name, spec in (("dielectric", dielectric), ("metal", metal)):
         if scene is not None and spec is not None:
             raise UsageError(f"{name} is of the grid: the materials of a scene have their own F0")
-    spheres = laid(scene, columns, rows, base_color)
+    spheres = layout_of(scene, columns, rows, base_color)
     material = Material(ndf_of(manifest) if ndf is None else ndf, "smith", dielectric, metal, diffuse, multiscatter)
     further = [chosen("light", spec) for spec in light]
     on = device if isinstance(device, Device) else choose_device(device)
@@ -480,7 +481,7 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         write_exr(output, np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
                   channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"), attributes=_stated(made))
     else:
-        draw_beside(output, [rendering.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
+        draw_side_by_side(output, [rendering.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
                          np.where(shown.covered, shown.luminance, np.nan), scale, engine.name, _caption(made),
                          {key: str(value) for key, value in _stated(made).items()})
     return made

@@ -57,7 +57,7 @@ def exposure_of(texels: np.ndarray) -> float:
     return 0.18 / max(average, mean / 4)
 
 
-def strip(levels: Sequence[np.ndarray], matte: np.ndarray, matrix: Matrix = WORLD) -> np.ndarray:
+def thumbnail(levels: Sequence[np.ndarray], matte: np.ndarray, matrix: Matrix = WORLD) -> np.ndarray:
     """(CELL, width, 4) uint8 in sRGB, from levels (6, s, s, 3): the first as a panorama, +X in its middle, then each on
     a metal sphere seen along -z, read in the mirror direction, and the irradiance `matte` (m, 3) at `normals()`.
     `matrix` takes the world's directions to those of the cubes."""
@@ -82,19 +82,19 @@ def normals() -> np.ndarray:
     return sphere(FINE)[2]
 
 
-def write_strip(path: str | os.PathLike[str], texels: tuple[Sequence[np.ndarray], np.ndarray, Matrix]) -> None:
-    """The strip of what `read_strip` gave, as a PNG. Raises FileError."""
-    write_png(path, strip(*texels), effort=5)  # a fifth of the time of 9, for 2 to 4 % more bytes
+def write_thumbnail(path: str | os.PathLike[str], texels: tuple[Sequence[np.ndarray], np.ndarray, Matrix]) -> None:
+    """The strip of what `read_thumbnail` gave, as a PNG. Raises FileError."""
+    write_png(path, thumbnail(*texels), effort=5)  # a fifth of the time of 9, for 2 to 4 % more bytes
 
 
-def read_strip(manifest: Path, told: Mapping[str, Any]) -> tuple[Sequence[np.ndarray], np.ndarray, Matrix]:
+def read_thumbnail(manifest: Path, stated: Mapping[str, Any]) -> tuple[Sequence[np.ndarray], np.ndarray, Matrix]:
     """Levels, irradiance and axes of a bake, from the files of the first of its engines that has a chain, `raw` first;
-    where none has one from an image. `told` is what the manifest holds.
+    where none has one from an image. `stated` is what the manifest holds.
 
     Raises FileError and InputError for files that are missing, changed or not valid, UnsupportedError where none can be
     decoded.
     """
-    recipe = told.get("recipe")
+    recipe = stated.get("recipe")
     names = recipe.get("for") if isinstance(recipe, Mapping) else None
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names) or not names:
         raise InputError(f"{manifest} names no engine that it was baked for")
@@ -110,22 +110,22 @@ def read_strip(manifest: Path, told: Mapping[str, Any]) -> tuple[Sequence[np.nda
             image = contents(folder / engine.holding("environment")[0].name.replace("{stem}", stem))
             if image.kind != "lat-long" or not image.levels:
                 continue
-            return [_of_latlong(image.levels[0].texels[..., :3])], _harmonics(manifest, told), WORLD
+            return [_of_latlong(image.levels[0].texels[..., :3])], _harmonics(manifest, stated), WORLD
         levels = [texels if texels.ndim == 4 else _of_octahedral(texels, lights.border) for texels in lights.levels]
-        return levels, _matte(manifest, told, engine, lights), engine.matrix
+        return levels, _matte(manifest, stated, engine, lights), engine.matrix
     assert why is not None
     raise why
 
 
-def _matte(manifest: Path, told: Mapping[str, Any], engine: Engine, lights: Lights) -> np.ndarray:
+def _matte(manifest: Path, stated: Mapping[str, Any], engine: Engine, lights: Lights) -> np.ndarray:
     if lights.irradiance is None:
-        return _harmonics(manifest, told)
+        return _harmonics(manifest, stated)
     return _read(_reduced(lights.irradiance), "normal", engine.matrix)
 
 
-def _harmonics(manifest: Path, told: Mapping[str, Any]) -> np.ndarray:
+def _harmonics(manifest: Path, stated: Mapping[str, Any]) -> np.ndarray:
     """(m, 3) E/π at a sphere's normals from the coefficients that every manifest has."""
-    sh = told.get("sh")
+    sh = stated.get("sh")
     try:
         values = np.array(sh["coefficients"] if isinstance(sh, Mapping) else None, np.float64)
     except (KeyError, TypeError, ValueError, OverflowError):

@@ -26,7 +26,7 @@ Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
-class Swatch:
+class MaterialSphere:
     """What one sphere is made of: base colour, metalness and perceptual roughness in [0, 1], and F0 of what is no
     metal, a number or RGB."""
 
@@ -38,11 +38,11 @@ class Swatch:
 
 
 @dataclass(frozen=True)
-class Laid:
+class SphereLayout:
     """Spheres row by row, `columns` to a row, the last row maybe shorter. `roughness` of the columns and `metalness` of
     the rows of a grid, empty for a scene's; and what the spheres leave out."""
 
-    swatches: tuple[Swatch, ...]
+    spheres: tuple[MaterialSphere, ...]
     columns: int
     roughness: tuple[float, ...] = ()
     metalness: tuple[float, ...] = ()
@@ -51,13 +51,13 @@ class Laid:
 
     @property
     def rows(self) -> int:
-        return -(-len(self.swatches) // self.columns)
+        return -(-len(self.spheres) // self.columns)
 
     def placed(self) -> tuple[dict[str, object], ...]:
         """Of a scene: each material's name, its row and column from 1, and what its sphere is made of."""
         return tuple({"name": s.name, "row": k // self.columns + 1, "column": k % self.columns + 1,
                       "base_color": s.base_color, "metalness": s.metalness, "roughness": s.roughness,
-                      "f0": s.insulator} for k, s in enumerate(self.swatches)) if self.scene else ()
+                      "f0": s.insulator} for k, s in enumerate(self.spheres)) if self.scene else ()
 
 
 def steps(count: int, alone: float) -> tuple[float, ...]:
@@ -70,7 +70,7 @@ def in_range(what: str, value: int, limits: tuple[int, int] = COUNT_RANGE) -> No
         raise UsageError(f"{what} {value} is outside [{limits[0]}, {limits[1]}]")
 
 
-def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0, 1.0, 1.0)) -> Laid:
+def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0, 1.0, 1.0)) -> SphereLayout:
     """Roughness 0 … 1 from left to right, 0 where there is one column, and metalness 0 … 1 from the top down, 1 where
     there is one row. Raises UsageError for what is out of its range."""
     in_range("columns", columns)
@@ -79,10 +79,11 @@ def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0,
     if color.shape != (3,) or not ((color >= 0) & (color <= 1)).all():
         raise UsageError(f"base color {' '.join(f'{c:g}' for c in color.ravel())} is not three numbers in [0, 1]")
     across, down = steps(columns, 0.0), steps(rows, 1.0)
-    return Laid(tuple(Swatch(_triple(color), m, r) for m in down for r in across), columns, across, down)
+    spheres = tuple(MaterialSphere(_triple(color), m, r) for m in down for r in across)
+    return SphereLayout(spheres, columns, across, down)
 
 
-def of_scene(scene: Scene, columns: int = 7) -> Laid:
+def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
     """A sphere for each material of a scene that light falls on, in the order of the file, at most MOST of them.
 
     Raises UsageError for columns out of range, InputError for a scene without such materials.
@@ -101,13 +102,13 @@ def of_scene(scene: Scene, columns: int = 7) -> Laid:
     unlit = [m.name for m in scene.materials if m.unlit]
     if unlit:
         notices.append(f"{_some(unlit)}: unlit, no sphere is drawn of it")
-    made = tuple(Swatch(_triple(np.clip(middle(m["base_color"]), 0, 1)), float(middle(m["metalness"])[0]),
+    made = tuple(MaterialSphere(_triple(np.clip(middle(m["base_color"]), 0, 1)), float(middle(m["metalness"])[0]),
                         float(middle(m["roughness"])[0]), insulator(m), m.name) for m in lit)
-    return Laid(made, min(columns, len(made)), notices=(*notices, *_left_out(lit)), scene=str(scene.path))
+    return SphereLayout(made, min(columns, len(made)), notices=(*notices, *_left_out(lit)), scene=str(scene.path))
 
 
-def laid(scene: str | os.PathLike[str] | None, columns: int, rows: int | None,
-         base_color: Sequence[float] | None) -> Laid:
+def layout_of(scene: str | os.PathLike[str] | None, columns: int, rows: int | None,
+         base_color: Sequence[float] | None) -> SphereLayout:
     """A scene's materials, or the grid where no scene is given. Raises as they and `read_scene` do, UsageError for what
     is of the grid alone."""
     if scene is None:
@@ -153,19 +154,19 @@ _TEXTURED = ("base_color", "metalness", "roughness", "ior", "specular", "specula
 def _left_out(lit: Sequence[Material]) -> list[str]:
     found = []
 
-    def told(who: Sequence[Material], what: str) -> None:
+    def add(who: Sequence[Material], what: str) -> None:
         if who:
             found.append(f"{_some([m.name for m in who])}: {what}")
 
     read = [m for m in lit if all(m[name].mean for name in _TEXTURED)]
-    told([m for m in read if any(b - a > EVEN for name in _TEXTURED
-                                 for a, b in zip(m[name].low, m[name].high, strict=True))],
-         "textures vary, the sphere has the mean of what is in use")
-    told([m for m in lit if m not in read], "textures that are not read, the sphere has the middle of what they can be")
+    add([m for m in read if any(b - a > EVEN for name in _TEXTURED
+                                for a, b in zip(m[name].low, m[name].high, strict=True))],
+        "textures vary, the sphere has the mean of what is in use")
+    add([m for m in lit if m not in read], "textures that are not read, the sphere has the middle of what they can be")
     for what, has, instead in _KINDS:
-        told([m for m in lit if has(m)], f"{what} is left out, {instead}")
+        add([m for m in lit if has(m)], f"{what} is left out, {instead}")
     for name in sorted({name for m in lit for name in m.unread}):
-        told([m for m in lit if name in m.unread], f"{name[:60]} is not read, what it falls back to is drawn")
+        add([m for m in lit if name in m.unread], f"{name[:60]} is not read, what it falls back to is drawn")
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.scenes.materials import Material, Scene
-from whitefurnace.scenes.scale import MEDIA, Judgement, Medium, Triple, footprint, judge, length, medium, told
+from whitefurnace.scenes.scale import MEDIA, Judgement, Medium, Triple, footprint, judge, length, length_text, medium
 
 TABLE = 64
 """Texels a side of a table of diffusion. Along n·l they are as far apart as those of an 8-bit diffuse ramp of 64."""
@@ -40,7 +40,7 @@ class Inside:
     @property
     def head(self) -> str:
         size = None if self.judgement is None else self.judgement.size
-        return (self.material or "the scene") + (f", {told(size)} across ({self.size_of})" if size else "")
+        return (self.material or "the scene") + (f", {length_text(size)} across ({self.size_of})" if size else "")
 
     @property
     def lines(self) -> tuple[str, ...]:
@@ -62,7 +62,7 @@ class Pixel:
 
     @property
     def text(self) -> str:
-        return f"a pixel is {told(self.metres)}" + (f", as {self.of} sees the nearest of it" if self.of else "")
+        return f"a pixel is {length_text(self.metres)}" + (f", as {self.of} sees the nearest of it" if self.of else "")
 
 
 # ------------------------------------------------------------------------------------------------------------- options

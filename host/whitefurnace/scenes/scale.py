@@ -84,7 +84,7 @@ def _positive(name: str, value: float) -> float:
     return value
 
 
-def told(metres: float) -> str:
+def length_text(metres: float) -> str:
     """A length as people write it: 0.5 mm, 3.4 m."""
     if math.isinf(metres):
         return "any distance"
@@ -309,14 +309,15 @@ def _absorbed(medium: Medium, size: float) -> Absorption:
     off = difference(through)
     half = _triple(math.log(2) * _inverse(np.array(medium.absorption)))
     least = int(np.argmin(through))
-    which = f"{_percent(through[least])} of the {COLOURS[least]} light is left after {told(size)}, ΔE*ab " + \
+    which = f"{_percent(through[least])} of the {COLOURS[least]} light is left after {length_text(size)}, ΔE*ab " + \
         (f"{off:.0f}" if off >= 10 else f"{off:.1f}")
     if not any(medium.absorption):
         verdict, reason = "negligible", "nothing is absorbed"
     elif off < NOTICEABLE:
         verdict, reason = "negligible", f"absorption is not noticed: {which}, of the {NOTICEABLE} that are"
     elif through.max() < BLACK:
-        verdict, reason = "opaque", f"nothing comes through: less than code 1 of 8-bit sRGB is left after {told(size)}"
+        verdict, reason = "opaque", ("nothing comes through: less than code 1 of 8-bit sRGB is left after "
+                                     f"{length_text(size)}")
     else:
         verdict, reason = "matters", f"absorption matters: {which}, where {NOTICEABLE} are noticed"
     return Absorption(verdict, _triple(through), off, half, reason)
@@ -342,17 +343,18 @@ def _left(medium: Medium, size: float | None, pixel: float) -> Transport:
     if size is not None and straight is not None:
         if difference(straight) < NOTICEABLE:
             return say("clear", f"scattering is not noticed: {_percent(straight.min())} of the light or more goes "
-                                f"straight on over {told(size)}")
+                                f"straight on over {length_text(size)}")
         if medium.reduced.max() * size < 1:
-            return say("cloudy", f"a volume, neither diffuse nor clear: light goes {told(1 / medium.reduced.max())} "
-                                 f"before it has turned, farther than the {told(size)} of the object")
+            turned = length_text(1 / medium.reduced.max())
+            return say("cloudy", f"a volume, neither diffuse nor clear: light goes {turned} "
+                                 f"before it has turned, farther than the {length_text(size)} of the object")
     colour = COLOURS[farthest]
     if widest <= pixel:
         return say("local", f"local diffuse is right: {_percent(SHARE)} of the {colour} light leaves within "
-                            f"{told(widest)} of where it entered, and a pixel is {told(pixel)}")
-    reach = (f"{_percent(share[farthest])} of the {colour} light leaves farther than a pixel of {told(pixel)} from "
-             f"where it entered, and {_percent(SHARE)} within {told(widest)}")
+                            f"{length_text(widest)} of where it entered, and a pixel is {length_text(pixel)}")
+    reach = (f"{_percent(share[farthest])} of the {colour} light leaves farther than a pixel of {length_text(pixel)} "
+             f"from where it entered, and {_percent(SHARE)} within {length_text(widest)}")
     if size is not None and widest > size:
         return say("translucent", f"subsurface scattering is needed, and light comes through: {reach}, where the "
-                                  f"object is {told(size)}")
+                                  f"object is {length_text(size)}")
     return say("subsurface", f"subsurface scattering is needed: {reach}")

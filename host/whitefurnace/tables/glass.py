@@ -13,7 +13,7 @@ from whitefurnace.catalogue.choice import Chosen
 from whitefurnace.catalogue.registry import REFRACTION
 from whitefurnace.catalogue.rule import LADDERS, Rule
 from whitefurnace.errors import UnsupportedError
-from whitefurnace.integrals.quadrature import Grid, Part, Tally, climb, grid_of, integrate, missed, room_for
+from whitefurnace.integrals.quadrature import Grid, Part, Totals, climb, grid_of, integrate, missed, room_for
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import finest
 from whitefurnace.opencl.device import Device
@@ -83,7 +83,7 @@ def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fre
                     32 if tolerance >= TOLERANCE else finest(device))
     left = tolerance - (LOST if part.precision == 32 else 0.0)
     values = room_for((*grid.shape, 2), precision, out)
-    flat, tally = values.reshape(grid.size, 2), Tally()
+    flat, totals = values.reshape(grid.size, 2), Totals()
     # Of light from the denser side the kernel gives what refraction takes from all that F = 1 would reflect.
     whole, error = None, 0.0
     if (n < 1).any():
@@ -94,15 +94,15 @@ def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fre
     for begin in range(0, grid.size, CELLS_A_LAUNCH):
         end = min(begin + CELLS_A_LAUNCH, grid.size)
         rows = grid.rows(part, begin, end)
-        found = climb(part, rows, left if whole is None else left / 2, tally)
+        found = climb(part, rows, left if whole is None else left / 2, totals)
         if whole is not None:
             all_of = np.broadcast_to(_beside(whole.values, grid.shape), grid.shape).flat[begin:end]
             found[0] = np.where(rows[-1] < 1, np.maximum(all_of - found[0], 0), found[0])
         flat[begin:end] = found.T
-    error += tally.error
-    notices = (*tally.notices(), *missed(error, tolerance, precision))
-    made = Integrated(values, error, tally.evaluations + (whole.evaluations if whole else 0),
-                      time.perf_counter() - start, tally.rule.name if tally.rule else "", notices)
+    error += totals.error
+    notices = (*totals.notices(), *missed(error, tolerance, precision))
+    made = Integrated(values, error, totals.evaluations + (whole.evaluations if whole else 0),
+                      time.perf_counter() - start, totals.rule.name if totals.rule else "", notices)
     if not report:
         return made, {}
     both = flat.sum(1, dtype=np.float64)
