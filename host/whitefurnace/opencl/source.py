@@ -1,4 +1,9 @@
-"""Recipe -> one kernel text: only the files it needs, each under its own #line, and a digest of the whole."""
+"""Assembles the text of each OpenCL program from the kernel files that it needs, with a digest of the whole.
+
+`PROGRAMS` is the table of all programs; a function below it fills in each row: `integration` for an integral over
+models, `octahedral` for the convolution of levels. Every file stands under its own `#line`, so that a compiler's
+message names the file.
+"""
 from __future__ import annotations
 
 import hashlib
@@ -10,42 +15,140 @@ from typing import Any
 
 from whitefurnace.catalogue import Integral, Model
 from whitefurnace.opencl import constants
-
-# Kernel functions by the macro that binds them: the name's ending and its own arguments, s a number, v a vector,
-# d a direction (a cosine for isotropic NDFs, a vector for anisotropic ones).
-FUNCTIONS = {
-    "NDF_D": ("D", "ss"),
-    "NDF_AREA": ("area", "d"),
-    "NDF_WIDTH": ("width", ""),
-    "NDF_REACH": ("reach", ""),
-    "NDF_STRETCH_X": ("stretch_x", ""),
-    "NDF_STRETCH_Y": ("stretch_y", ""),
-    "NDF_SAMPLE": ("sample", "s"),
-    "MASKING_AT": ("at", "d"),
-    "MASKING_V": ("V", "ssssss"),
-    "MASKING_G": ("G", "ssssss"),
-    "MASKING_G1": ("G1", "ss"),
-    "FRESNEL_F": ("F", "s"),
-    "DIFFUSE_F": ("f", "vv"),
-    "BRDF_F": ("f", "vv"),
-    "LIGHT_L": ("L", "v"),
-    "LIGHT_C": ("C", "v"),
-    "SPECULAR_F": ("f", "vv"),  # of the slots ndf, masking and fresnel together: specular.clh
-}
+from whitefurnace.opencl.bindings import FUNCTIONS, VECTOR, bindings, is_isotropic
 
 LOBE_WIDTH = 0.05
-"""Where the rule of a user's BRDF grades its half vectors, radians: lobes ten times narrower are still met."""
+"""Where the rule of a user's BRDF grades its half vectors, in radians. Lobes ten times narrower are still met."""
 
 LEAST_COSINE = 1e-9
-"""The least cosine a BRDF given as f(l, v) is asked at, for those that divide by it: the limit for all purposes."""
+"""The least cosine at which a BRDF given as f(l, v) is evaluated. It stands for the limit at grazing, where some BRDFs
+divide by the cosine."""
+
+OUTLINE = ("Cx", "Cy", "Cz", "Ax", "Ay", "Az", "Bx", "By", "Bz", "length", "scale")
+"""A panel of an area light's outline as `radiance_outline.cl` reads it, after the view."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """A program's text and its digest (sha256 hex)."""
+    """A program's text and its digest (sha256, hexadecimal)."""
 
     text: str
     digest: str
+
+
+@dataclass(frozen=True)
+class Assembly:
+    """How the text of a program is put together: one row of `PROGRAMS`.
+
+    pieces: its pieces in order. A name is a kernel file, where {words} are filled in; `<name>` is a generated piece:
+      `<bindings>` binds the slots, `<models>` are the texts of their models, `<grid>`, `<anterpolation>` and
+      `<classes>` are constants of the host, and the others are given by the function that assembles the program.
+    slots: the slots that it may bind.
+    cells: what a cell of its input holds before the numbers of the models.
+    defines: macros that its kernels ask for, as `NAME` or `NAME VALUE`; {words} are filled in.
+    """
+
+    pieces: tuple[str, ...]
+    slots: tuple[str, ...] = ()
+    cells: tuple[str, ...] = ("NoV",)
+    defines: tuple[str, ...] = ()
+
+
+_MODELS = ("<bindings>", "<models>")
+_MICROFACETS = ("ndf", "masking", "fresnel")
+_LEAST = f"LEAST_COSINE ((scalar){LEAST_COSINE!r})"
+_WIDTH = f"LOBE_WIDTH ((scalar){LOBE_WIDTH!r})"
+_OF_LIGHTS = ("NoV", "phi", *OUTLINE)
+
+PROGRAMS: Mapping[str, Assembly] = {
+    # Integrals over models, one value a cell.
+    "integral": Assembly(
+        ("real.clh", *_MODELS, "facet.clh", "ring.clh", "integrand/{integral}.clh", "integrate.cl"),
+        slots=_MICROFACETS, defines=("{support}",)),
+    "integral of an anisotropic NDF": Assembly(
+        ("real.clh", *_MODELS, "facet.clh", "integrand/{integral}.clh", "stretched.cl"),
+        slots=_MICROFACETS, cells=("NoV", "phi"), defines=("{support}",)),
+    "integral in closed form": Assembly(
+        ("real.clh", *_MODELS, "{file}"), slots=("ndf", "masking")),
+    "fit of linearly transformed cosines": Assembly(
+        ("real.clh", *_MODELS, "facet.clh", "ring.clh", "specular.clh", "ltc.cl"),
+        slots=_MICROFACETS, cells=("NoV", "per_albedo", "xx", "xz", "zx", "zz"), defines=("HALF_ANGLE",)),
+    "rough boundary": Assembly(
+        ("real.clh", *_MODELS, "glass.cl"), slots=_MICROFACETS),
+    "table of Smith's area": Assembly(
+        ("real.clh", *_MODELS, "ring.clh", "area.cl"), slots=("ndf",), defines=("POLAR",)),
+    "albedo of a diffuse model": Assembly(
+        ("real.clh", *_MODELS, "<scatter>", "hemisphere.cl"),
+        slots=("diffuse",), defines=("SMOOTH", "AZIMUTH_PANELS 2", "COMPONENTS 1", _WIDTH, _LEAST)),
+    "albedo of a whole BRDF": Assembly(
+        ("real.clh", *_MODELS, "ring.clh", "<scatter>", "hemisphere.cl"),
+        slots=("brdf",), cells=("NoV", "phi"),
+        defines=("HALF_ANGLE", "AZIMUTH_PANELS 4", "COMPONENTS 3", _WIDTH, _LEAST)),
+    "function of a model": Assembly(
+        ("real.clh", *_MODELS, "<evaluate>", "evaluate.cl"),
+        slots=(*_MICROFACETS, "diffuse", "brdf", "light"), cells=()),
+    "specular BRDF": Assembly(
+        ("real.clh", *_MODELS, "specular.clh", "<evaluate>", "evaluate.cl"), slots=_MICROFACETS, cells=()),
+    # Reflected radiance.
+    "light on a specular surface": Assembly(
+        ("real.clh", *_MODELS, "facet.clh", "radiance_outline.cl"),
+        slots=_MICROFACETS, cells=_OF_LIGHTS, defines=("COMPONENTS 1", _WIDTH, _LEAST)),
+    "light on a diffuse surface": Assembly(
+        ("real.clh", *_MODELS, "<scatter>", "radiance_outline.cl"),
+        slots=("diffuse",), cells=_OF_LIGHTS, defines=("SMOOTH", "COMPONENTS 1", _WIDTH, _LEAST)),
+    "light on a whole BRDF": Assembly(
+        ("real.clh", *_MODELS, "<scatter>", "radiance_outline.cl"),
+        slots=("brdf",), cells=_OF_LIGHTS, defines=("WHOLE", "COMPONENTS 3", _WIDTH, _LEAST)),
+    "environment on a surface": Assembly(
+        ("real.clh", *_MODELS, "<scatter>", "radiance_nodes.cl"),
+        slots=("diffuse", "brdf"), cells=("NoV", "phi"), defines=(_LEAST,)),
+    "environment on a specular surface": Assembly(
+        ("real.clh", *_MODELS, "specular.clh", "<scatter>", "radiance_nodes.cl"),
+        slots=(*_MICROFACETS, "diffuse"), cells=("NoV", "phi"), defines=(_LEAST,)),
+    "nodes in the frame of a surface": Assembly(
+        ("real.clh", "sphere.clh", "texels/{kind}.clh", "radiance_texels.cl")),
+    "reflectance integral": Assembly(
+        # samples.cl makes reals of what special.clh calls bits: one macro, of either.
+        ("real.clh", "sphere.clh", *_MODELS, "<between>", "pyramid.cl", "samples.cl", "truth.cl"),
+        slots=(*_MICROFACETS, "diffuse"), cells=(), defines=("{how}", "SETS {sets}")),
+    # Prefiltering.
+    "convolution with an NDF": Assembly(
+        ("real.clh", *_MODELS, "window.clh", "lobe.clh", "prefilter.cl"), slots=("ndf",)),
+    "convolution with the cosine": Assembly(
+        ("real.clh", "window.clh", "lobe_cosine.clh", "prefilter.cl")),
+    "texels near a narrow lobe": Assembly(
+        ("real.clh", "sphere.clh", "texels/{kind}.clh", *_MODELS, "window.clh", "lobe.clh", "exact.cl"),
+        slots=("ndf",)),
+    "convolution by the symmetries of the cube": Assembly(
+        ("real.clh", "sphere.clh", "<classes>", "orbits.clh", "window.clh", "lobe_table.clh", "octahedral.cl")),
+    "bright texels under an NDF": Assembly(
+        ("real.clh", "sphere.clh", "orbits.clh", *_MODELS, "lobe.clh", "apart.cl"), slots=("ndf",)),
+    "bright texels under the cosine": Assembly(
+        ("real.clh", "sphere.clh", "orbits.clh", "lobe_cosine.clh", "apart.cl")),
+    "interpolation": Assembly(
+        ("real.clh", "sphere.clh", "<grid>", "grid.clh", "interpolate.cl")),
+    "nodes and harmonics": Assembly(
+        ("real.clh", "sphere.clh", "texels/{kind}.clh", "<grid>", "grid.clh", "<anterpolation>", "anterpolate.cl",
+         "harmonics.cl")),
+    "importance sampling": Assembly(
+        ("real.clh", "sphere.clh", "pyramid.cl", "samples.cl")),
+    "means over texels": Assembly(
+        ("real.clh", "sphere.clh", "overlap.cl")),
+    # Others.
+    "built-in environment": Assembly(
+        ("real.clh", "demo.cl")),
+    "limits of a device": Assembly(
+        ("real.clh", "yardstick.cl")),
+}
+"""Every program: its kernel files, the slots that it binds, and what its kernels are told."""
+
+
+_CONSTANTS: Mapping[str, Callable[[], str]] = {
+    "grid": constants.grid_defines,
+    "anterpolation": constants.anterpolation_defines,
+    "classes": constants.class_defines,
+}
+"""Generated pieces that hold constants of the host."""
 
 
 @cache
@@ -55,8 +158,9 @@ def _file(name: str) -> str:
 
 @cache
 def everything() -> str:
-    """A digest of all kernel files, for programs that are put together as they are needed."""
+    """Return a digest of all kernel files and shared constants, for results that many programs take part in."""
     digest, folders = hashlib.sha256(), [(resources.files("whitefurnace.kernels"), "")]
+    digest.update("".join(make() for make in _CONSTANTS.values()).encode())
     while folders:
         folder, path = folders.pop()
         for item in sorted(folder.iterdir(), key=lambda item: item.name):
@@ -67,323 +171,243 @@ def everything() -> str:
     return digest.hexdigest()
 
 
-def _assemble(parts: Sequence[str | tuple[str, str]]) -> Source:
-    """Joins files (by name) and generated pieces (name, text), each with a #line that names it."""
-    lines = []
-    for part in parts:
-        name, text = part if isinstance(part, tuple) else (part, _file(part))
+def assembled(program: str, slots: Mapping[str, Model] | None = None, area_terms: int = 0, *,
+              cells: Sequence[str] | None = None, pieces: Mapping[str, str] | None = None, **words: str) -> Source:
+    """Return the text of a program of `PROGRAMS` with its digest.
+
+    slots: the models that it binds. area_terms: length of the tabulated Smith area, 0 for none. cells: what a cell
+    holds before the numbers of the models, where the program leaves that open. pieces: texts of its generated pieces.
+    words: what is filled into its names of files and macros.
+    """
+    row, bound, texts = PROGRAMS[program], slots or {}, pieces or {}
+    assert set(bound) <= set(row.slots), f"{program} binds {row.slots}, not {tuple(bound)}"
+    lines: list[str] = []
+
+    def add(name: str, text: str) -> None:
         quoted = name.replace("\\", "/").replace('"', "'")
         lines.append(f'#line 1 "{quoted}"\n{text.rstrip()}\n')
+
+    for piece in row.pieces:
+        name = piece.strip("<>")
+        if name == piece:
+            file = piece.format(**words)
+            add(file, _file(file))
+        elif name == "bindings":
+            defines = "".join(f"#define {define.format(**words)}\n" for define in row.defines)
+            add(name, defines + bindings(bound, cells=row.cells if cells is None else cells, area_terms=area_terms))
+        elif name == "models":
+            for file in ("special.clh", *(("area_table.clh",) if area_terms else ())):
+                add(file, _file(file))
+            for entry in bound.values():
+                if entry.text is None:
+                    add(entry.kernel_file, _file(entry.kernel_file))
+                else:
+                    add(entry.path or entry.name, entry.text)
+        else:
+            add(name, _CONSTANTS[name]() if name in _CONSTANTS else texts[name])
     whole = "".join(lines)
     return Source(whole, hashlib.sha256(whole.encode()).hexdigest())
 
 
-class _Very:
-    """A model as the key of what is made from it: this very entry, not one of the same name."""
+class EntryKey:
+    """A model as the key of what is made from it: this very entry, not another one of the same name."""
 
     def __init__(self, entry: Model) -> None:
         self.entry = entry
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Very) and self.entry is other.entry
+        return isinstance(other, EntryKey) and self.entry is other.entry
 
     def __hash__(self) -> int:
         return id(self.entry)
 
 
 def _kept(make: Callable[..., Source]) -> Callable[..., Source]:
-    """The same text for the same arguments: a level asks for its programs at every launch."""
-    made = lru_cache(maxsize=64)(lambda *given: make(*(g.entry if isinstance(g, _Very) else g for g in given)))
+    """Keep the last texts of a function by its arguments: a level asks for its programs at every launch."""
+    made = lru_cache(maxsize=64)(lambda *given: make(*(g.entry if isinstance(g, EntryKey) else g for g in given)))
 
     @wraps(make)
     def found(*given: Any) -> Source:
-        return made(*(_Very(g) if isinstance(g, Model) else g for g in given))
+        return made(*(EntryKey(g) if isinstance(g, Model) else g for g in given))
 
     return found
 
 
-def arguments(function: str, isotropic: bool = True) -> str:
-    """The own arguments of a kernel function, s for a number and v for a vector."""
-    if function == "NDF_D" and not isotropic:
-        return "v"
-    return FUNCTIONS[function][1].replace("d", "s" if isotropic else "v")
-
-
-def _model_text(entry: Model) -> str | tuple[str, str]:
-    return entry.kernel_file if entry.text is None else (entry.path or entry.name, entry.text)
-
-
-def _bindings(slots: Mapping[str, Model], *, cells: Sequence[str] = ("NoV",), area_terms: int = 0) -> str:
-    """The #defines that bind each slot to its model: parameter lists, values and functions.
-
-    Lists begin with a comma, so that a model without parameters leaves nothing behind. A slot whose model
-    needs another slot's function carries that slot's parameters too. `cells` names the rows of a cell before the
-    models' numbers; `area_terms` is the length of the tabulated Smith area, 0 for none.
-    """
-    isotropic = "ndf" not in slots or slots["ndf"].isotropic
-    lines = [f"#define DIRECTION {'real' if isotropic else 'real3'}",
-             f"#define COS_OF(d) {'(d)' if isotropic else '((d).z)'}"]
-    if not isotropic:
-        lines.append("#define ANISOTROPIC")
-    area = [f"ndf_area_{name}" for name in ("scale", "per_range", "grazing")]
-    table = [*(("real", name) for name in area), ("const real *", "ndf_area_terms")] if area_terms else []
-    if area_terms:
-        lines.append(f"#define AREA_TERMS {area_terms}")
-    own = {slot: [("real", f"{slot}_{name}") for name in entry.arguments] for slot, entry in slots.items()}
-    bound: set[str] = set()
-    for slot, entry in slots.items():
-        needed = {name.split("_")[0].lower() for name in entry.needs} - {slot}
-        listed = [n for other in sorted(needed) for n in own[other]] + own[slot]
-        if slot == "ndf" or "ndf" in needed:
-            listed += table
-        upper = slot.upper()
-        for kind, form in (("PARAMETERS", ", {0} {1}"), ("VALUES", ", {1}"), ("SCALARS", ", const scalar {1}")):
-            kept = [n for n in listed if kind != "SCALARS" or n not in table]
-            lines.append(f"#define {upper}_{kind} " + "".join(form.format(*n) for n in kept))
-        for function in entry.provides:
-            ending = FUNCTIONS[function][0]
-            dummies = [f"a{k}" for k in range(len(arguments(function, isotropic)))]
-            passed = dummies[:1] if function == "NDF_D" and not entry.takes_sin2 else dummies
-            target, name = f"{slot}_{entry.name}_{ending}", function
-            head = f"({', '.join(dummies)})" if dummies else ""
-            if slot in ("ndf", "diffuse", "brdf", "light"):  # self-contained: its signature names its own numbers
-                call = f"{target}({', '.join([*passed, *(f'{slot}_{n}' for n in entry.passed(function))])})"
-                if function == "NDF_D":
-                    # D is 0 for backfacing m, whatever the model, and a user's is divided by its norm: said once.
-                    name, scaled = "NDF_D_FRONT", "" if entry.text is None else "ndf_per_norm * "
-                    lines.append("#define NDF_D(a0) ((a0).z > 0 ? NDF_D_FRONT(a0) : (real)0)" if not isotropic else
-                                 "#define NDF_D(a0, a1) ((a0) > 0 ? NDF_D_FRONT(a0, a1) : (real)0)")
-                    call = f"({scaled}{call})"
-            else:
-                call = f"{target}({', '.join(passed)} {upper}_VALUES)"
-            lines.append(f"#define {name}{head} {call}")
-            bound.add(function)
-    if area_terms:
-        lines.append("#define NDF_AREA(d) area_of_table(d, " + ", ".join(area) + ", ndf_area_terms)")
-    if "ndf" in slots:
-        if slots["ndf"].text is not None:
-            lines.append("#define NDF_WIDTH ndf_lobe_width")
-        if "NDF_REACH" not in bound:
-            # Polar angle; stretched slope for anisotropic ones, where A has α/r beyond r for the longest tail.
-            lines.append(f"#define NDF_REACH ((real){'HALF_PI' if isotropic else '(PRECISION == 64 ? 1e14f : 1e7f)'})")
-    if "masking" not in slots:
-        lines.append("#define MASKING_AT(d) ((real)0)")
-    rows = [*(f"cell_{name}" for name in cells), *(n for slot in slots for _, n in own[slot])]
-    names = [n for slot in slots for n in own[slot]] + table
-    lines.append("#define CELL_PARAMETERS " + "".join(f", {kind} {n}" for kind, n in names))
-    lines.append("#define CELL_VALUES " + "".join(f", {n}" for _, n in names))
-    lines.append("#define CELL_ARRAYS , __global const scalar *restrict cell_values")
-    loads = [f"const real {n} = LOAD(g, cell_values + (size_t){k} * cells);" for k, n in enumerate(rows)]
-    if area_terms:
-        first = len(rows)
-        for k, name in enumerate(area):
-            loads.append(f"const real {name} = LOAD(g, cell_values + (size_t){first + k} * cells);")
-        loads.append(f"real ndf_area_terms[AREA_TERMS]; for (int k = 0; k < AREA_TERMS; k++) "
-                     f"ndf_area_terms[k] = LOAD(g, cell_values + (size_t)({first + len(area)} + k) * cells);")
-    lines.append("#define CELL_LOAD " + " ".join(loads))
-    return "\n".join(lines) + "\n"
-
-
-def cell_parameters(slots: Mapping[str, Model]) -> list[tuple[str, str]]:
-    """(slot, number) in the order in which kernels read them: parameters and constants of each slot."""
-    return [(slot, name) for slot, entry in slots.items() for name in entry.arguments]
-
-
-def _models(slots: Mapping[str, Model], area_terms: int) -> list[str | tuple[str, str]]:
-    """The texts of the models, and of the table where Smith's area comes from one."""
-    return ["special.clh", *(["area_table.clh"] if area_terms else []), *(_model_text(m) for m in slots.values())]
+# ---------------------------------------------------------------------------------------------- integrals
 
 
 def integration(integral: Integral, slots: Mapping[str, Model], area_terms: int = 0) -> Source:
-    """The program of one integral over the models of `slots` (in the order ndf, masking, fresnel)."""
-    isotropic = slots["ndf"].isotropic
-    cells = ("NoV",) if isotropic else ("NoV", "phi")
-    support = f"#define {integral.support}\n"
-    return _assemble(["real.clh", ("bindings", support + _bindings(slots, cells=cells, area_terms=area_terms)),
-                      *_models(slots, area_terms), "facet.clh", *(["ring.clh"] if isotropic else []),
-                      f"integrand/{integral.name}.clh", "integrate.cl" if isotropic else "stretched.cl"])
+    """Return the program of one integral over the models of `slots`, in the order ndf, masking, fresnel.
+
+    area_terms: length of the tabulated Smith area that the masking reads, 0 for a closed form.
+    """
+    program = "integral" if slots["ndf"].isotropic else "integral of an anisotropic NDF"
+    return assembled(program, slots, area_terms, integral=integral.name, support=integral.support)
 
 
 def closed(file: str, slots: Mapping[str, Model]) -> Source:
-    """The program of an integral that has a kernel of its own for these models (`catalogue.registry.CLOSED`)."""
-    return _assemble(["real.clh", ("bindings", _bindings(slots)), *_models(slots, 0), file])
+    """Return the program of an integral that has a kernel of its own, `file`, for the models of `slots`.
+
+    `catalogue.registry.CLOSED` lists these.
+    """
+    return assembled("integral in closed form", slots, file=file)
 
 
 def transformed(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
-    """The program that fits linearly transformed cosines to a specular BRDF and tells how far they are from it."""
-    cells = ("NoV", "per_albedo", "xx", "xz", "zx", "zz")
-    return _assemble(["real.clh", ("bindings", "#define HALF_ANGLE\n" + _bindings(slots, cells=cells,
-                                                                                 area_terms=area_terms)),
-                      *_models(slots, area_terms), "facet.clh", "ring.clh", "specular.clh", "ltc.cl"])
+    """Return the program that fits linearly transformed cosines to a specular BRDF and measures the fit."""
+    return assembled("fit of linearly transformed cosines", slots, area_terms)
 
 
 def refraction(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
-    """The program of what a rough boundary reflects and refracts, of the slots ndf, masking and fresnel."""
-    return _assemble(["real.clh", ("bindings", _bindings(slots, area_terms=area_terms)), *_models(slots, area_terms),
-                      "glass.cl"])
+    """Return the program of the light that a rough boundary reflects and refracts: slots ndf, masking, fresnel."""
+    return assembled("rough boundary", slots, area_terms)
 
 
 def area(ndf: Model) -> Source:
-    """The program that makes the table of Smith's area."""
-    return _assemble(["real.clh", ("bindings", "#define POLAR\n" + _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0),
-                      "ring.clh", "area.cl"])
+    """Return the program that computes the projected area of an NDF, for the table of Smith's area."""
+    return assembled("table of Smith's area", {"ndf": ndf})
 
 
 def hemisphere(entry: Model) -> Source:
-    """The program of the directional albedo of a BRDF f(l, v): a diffuse model, or a user's whole one."""
-    smooth = entry.slot == "diffuse"
-    result = ("sum[0] += w * DIFFUSE_F(l, v);" if smooth else
-              "const real3 f = BRDF_F(l, v); sum[0] += w * f.x; sum[1] += w * f.y; sum[2] += w * f.z;")
-    defines = (f"{'#define SMOOTH' if smooth else '#define HALF_ANGLE'}\n#define AZIMUTH_PANELS {2 if smooth else 4}\n"
-               f"#define COMPONENTS {1 if smooth else 3}\n#define LOBE_WIDTH ((scalar){LOBE_WIDTH!r})\n"
-               f"#define LEAST_COSINE ((scalar){LEAST_COSINE!r})\n")
-    scatter = f"static inline void scatter(real *sum, real w, real3 l, real3 v CELL_PARAMETERS) {{ {result} }}\n"
-    slots = {entry.slot: entry}
-    cells = ("NoV",) if smooth else ("NoV", "phi")
-    return _assemble(["real.clh", ("bindings", defines + _bindings(slots, cells=cells)),
-                      *_models(slots, 0), *([] if smooth else ["ring.clh"]), ("scatter", scatter), "hemisphere.cl"])
+    """Return the program of the directional albedo of a BRDF f(l, v): a diffuse model, or a user's whole BRDF."""
+    program = "albedo of a diffuse model" if entry.slot == "diffuse" else "albedo of a whole BRDF"
+    return assembled(program, {entry.slot: entry}, pieces={
+        "scatter": _scatter("sum[0] += w * DIFFUSE_F(l, v);" if entry.slot == "diffuse" else _WHOLE)})
 
 
 def evaluation(function: str, slots: Mapping[str, Model], area_terms: int = 0) -> Source:
-    """The program that evaluates `function` (`NDF_D`, `MASKING_V`, …) of `slots` at given arguments: `evaluate.cl`.
+    """Return the program that evaluates `function` (`NDF_D`, `MASKING_V`, …) of `slots` at given arguments.
 
-    `SPECULAR_F` is the specular BRDF at (l, v), of the slots ndf, masking and fresnel.
-
-    A cell holds the function's own arguments, three rows for a vector, then the models' numbers.
+    `SPECULAR_F` is the specular BRDF at (l, v) of the slots ndf, masking and fresnel. A cell holds the function's own
+    arguments, three rows for a vector, then the numbers of the models.
     """
-    isotropic = "ndf" not in slots or slots["ndf"].isotropic
     rows, values = [], []
-    whole = function == "SPECULAR_F"
-    for k, kind in enumerate(arguments(function, isotropic)):
-        names = [f"{k}{axis}" for axis in ("xyz" if kind == "v" else ("",))]
+    for k, kind in enumerate(FUNCTIONS[function].kinds(is_isotropic(slots))):
+        names = [f"{k}{axis}" for axis in (*"xyz",)] if kind is VECTOR else [str(k)]
         rows += names
-        values.append(f"vec3({', '.join(f'cell_{n}' for n in names)})" if kind == "v" else f"cell_{names[0]}")
+        values.append(f"vec3({', '.join(f'cell_{n}' for n in names)})" if kind is VECTOR else f"cell_{names[0]}")
     call = f"{function}({', '.join(values)})" if values else function
     if function == "BRDF_F":
         result = (f"const real3 f = {call}; STORE(f.x, g, out); STORE(f.y, g, out + (size_t)cells); "
                   "STORE(f.z, g, out + 2 * (size_t)cells);")
     else:
         result = f"STORE({call}, g, out);"
-    return _assemble(["real.clh", ("bindings", _bindings(slots, cells=rows, area_terms=area_terms)),
-                      *_models(slots, area_terms), *(["specular.clh"] if whole else []),
-                      ("evaluate", f"#define EVALUATE {result}\n"), "evaluate.cl"])
+    return assembled("specular BRDF" if function == "SPECULAR_F" else "function of a model", slots, area_terms,
+                     cells=rows, pieces={"evaluate": f"#define EVALUATE {result}\n"})
 
 
-OUTLINE = ("Cx", "Cy", "Cz", "Ax", "Ay", "Az", "Bx", "By", "Bz", "length", "scale")
-"""A panel of an area light's outline as `radiance_outline.cl` reads it, after the view."""
+# ---------------------------------------------------------------------------------------------- radiance
+
+_WHOLE = "const real3 f = BRDF_F(l, v); sum[0] += w * f.x; sum[1] += w * f.y; sum[2] += w * f.z;"
 
 
-def _scatter(slots: Mapping[str, Model], components: int) -> str:
-    """`scatter`: adds w f(l, v) of the slots, all together, to one sum or to one for each channel."""
-    terms = [term for slot, term in (("ndf", "SPECULAR_F(l, v)"), ("diffuse", "DIFFUSE_F(l, v)")) if slot in slots]
-    if "brdf" in slots:
-        body = "const real3 f = BRDF_F(l, v); sum[0] += w * f.x; sum[1] += w * f.y; sum[2] += w * f.z;"
-    else:
-        body = f"const real f = w * ({' + '.join(terms)}); " + " ".join(f"sum[{c}] += f;" for c in range(components))
+def _scatter(body: str) -> str:
+    """Define `scatter`, which adds w f(l, v) to one sum or to one for each channel."""
     return f"static inline void scatter(real *sum, real w, real3 l, real3 v CELL_PARAMETERS) {{ {body} }}\n"
 
 
+def _scatter_of(slots: Mapping[str, Model], components: int) -> str:
+    """Define `scatter` for the BRDF of all slots together."""
+    if "brdf" in slots:
+        return _scatter(_WHOLE)
+    terms = [term for slot, term in (("ndf", "SPECULAR_F(l, v)"), ("diffuse", "DIFFUSE_F(l, v)")) if slot in slots]
+    sums = " ".join(f"sum[{c}] += f;" for c in range(components))
+    return _scatter(f"const real f = w * ({' + '.join(terms)}); {sums}")
+
+
 def outline(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
-    """The program of reflected radiance over the outline of an area light, of one summand of the BRDF."""
-    specular = "ndf" in slots
-    kind = "" if specular else "#define SMOOTH\n" if "diffuse" in slots else "#define WHOLE\n"
-    components = 3 if "brdf" in slots else 1
-    defines = (f"{kind}#define COMPONENTS {components}\n#define LOBE_WIDTH ((scalar){LOBE_WIDTH!r})\n"
-               f"#define LEAST_COSINE ((scalar){LEAST_COSINE!r})\n")
-    return _assemble(["real.clh", ("bindings", defines + _bindings(slots, cells=("NoV", "phi", *OUTLINE),
-                                                                   area_terms=area_terms)),
-                      *_models(slots, area_terms),
-                      "facet.clh" if specular else ("scatter", _scatter(slots, components)), "radiance_outline.cl"])
+    """Return the program of reflected radiance over the outline of an area light, for one summand of the BRDF."""
+    if "ndf" in slots:
+        return assembled("light on a specular surface", slots, area_terms)
+    program, components = (("light on a diffuse surface", 1) if "diffuse" in slots else ("light on a whole BRDF", 3))
+    return assembled(program, slots, area_terms, pieces={"scatter": _scatter_of(slots, components)})
 
 
 def lit_nodes(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
-    """The program of reflected radiance over a list of an environment's nodes, of the whole BRDF."""
-    defines = f"#define LEAST_COSINE ((scalar){LEAST_COSINE!r})\n"
-    return _assemble(["real.clh", ("bindings", defines + _bindings(slots, cells=("NoV", "phi"),
-                                                                   area_terms=area_terms)),
-                      *_models(slots, area_terms), *(["specular.clh"] if "ndf" in slots else []),
-                      ("scatter", _scatter(slots, 3)), "radiance_nodes.cl"])
+    """Return the program of reflected radiance over a list of an environment's nodes, for the whole BRDF."""
+    program = "environment on a specular surface" if "ndf" in slots else "environment on a surface"
+    return assembled(program, slots, area_terms, pieces={"scatter": _scatter_of(slots, 3)})
 
 
 def frame_nodes(kind: str) -> Source:
-    """Nodes of a source of the kind "latlong" or "cube" in the frame of a surface."""
-    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", "radiance_texels.cl"])
+    """Return the program that turns nodes of a source, "latlong" or "cube", into the frame of a surface."""
+    return assembled("nodes in the frame of a surface", kind=kind)
+
+
+def truth(slots: Mapping[str, Model], how: str, sets: int, area_terms: int = 0) -> Source:
+    """Return the program of the reflectance integral at surface points.
+
+    slots: ndf, masking and fresnel, or diffuse. how: the macro that says how directions are drawn. sets: how many sets
+    of the models' numbers it sums at once.
+    """
+    return assembled("reflectance integral", slots, area_terms, how=how, sets=str(sets),
+                     pieces={"between": "#undef TO_REAL\n"})
+
+
+# ---------------------------------------------------------------------------------------------- prefiltering
 
 
 @_kept
 def convolution(ndf: Model | None) -> Source:
-    """The zonal convolution with the lobe of an NDF, or with the cosine lobe of irradiance for None."""
-    if ndf is None:
-        return _assemble(["real.clh", "window.clh", "lobe_cosine.clh", "prefilter.cl"])
-    return _assemble(["real.clh", ("bindings", _bindings({"ndf": ndf})), *_models({"ndf": ndf}, 0), "window.clh",
-                      "lobe.clh", "prefilter.cl"])
+    """Return the zonal convolution with the lobe of an NDF, or with the cosine lobe of irradiance for None."""
+    return assembled("convolution with the cosine") if ndf is None else \
+        assembled("convolution with an NDF", {"ndf": ndf})
 
 
 @_kept
 def near_texels(kind: str, ndf: Model) -> Source:
-    """The exact integral of a narrow lobe over the texels near its direction, of a source of the kind "latlong" or
-    "cube"."""
-    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", ("bindings", _bindings({"ndf": ndf})),
-                      *_models({"ndf": ndf}, 0), "window.clh", "lobe.clh", "exact.cl"])
+    """Return the exact integral of a narrow lobe over the texels near its direction.
+
+    kind: "latlong" or "cube", the form of the source.
+    """
+    return assembled("texels near a narrow lobe", {"ndf": ndf}, kind=kind)
 
 
 @_kept
 def octahedral() -> Source:
-    """The zonal convolution by the symmetries of the cube, of any lobe."""
-    return _assemble(["real.clh", "sphere.clh", ("constants", constants.class_defines()), "orbits.clh", "window.clh",
-                      "lobe_table.clh", "octahedral.cl"])
+    """Return the zonal convolution by the symmetries of the cube, with any lobe."""
+    return assembled("convolution by the symmetries of the cube")
 
 
 @_kept
 def apart(ndf: Model | None) -> Source:
-    """The excess of bright texels under the lobe of an NDF, or under the cosine of irradiance for None."""
-    if ndf is None:
-        return _assemble(["real.clh", "sphere.clh", "orbits.clh", "lobe_cosine.clh", "apart.cl"])
-    return _assemble(["real.clh", "sphere.clh", "orbits.clh", ("bindings", _bindings({"ndf": ndf})),
-                      *_models({"ndf": ndf}, 0), "lobe.clh", "apart.cl"])
+    """Return the excess of bright texels under the lobe of an NDF, or under the cosine of irradiance for None."""
+    return assembled("bright texels under the cosine") if ndf is None else \
+        assembled("bright texels under an NDF", {"ndf": ndf})
 
 
 @_kept
 def interpolation() -> Source:
-    """Levels from their values at the nodes of a grid."""
-    return _assemble(["real.clh", "sphere.clh", ("constants", constants.grid_defines()), "grid.clh", "interpolate.cl"])
+    """Return the program that interpolates levels from their values at the nodes of a grid."""
+    return assembled("interpolation")
 
 
 @_kept
 def texels(kind: str) -> Source:
-    """Nodes and anterpolation of a source of the kind "latlong" or "cube", and spherical harmonics."""
-    shared = constants.grid_defines() + constants.anterpolation_defines()
-    return _assemble(["real.clh", "sphere.clh", f"texels/{kind}.clh", ("constants", shared), "grid.clh",
-                      "anterpolate.cl", "harmonics.cl"])
+    """Return the program of a source's nodes, their anterpolation and spherical harmonics.
+
+    kind: "latlong" or "cube", the form of the source.
+    """
+    return assembled("nodes and harmonics", kind=kind)
 
 
 @_kept
 def samples() -> Source:
-    """The pyramid of a cube, and filtered importance sampling of it."""
-    return _assemble(["real.clh", "sphere.clh", "pyramid.cl", "samples.cl"])
-
-
-def truth(slots: Mapping[str, Model], how: str, sets: int, area_terms: int = 0) -> Source:
-    """The reflectance integral of surface points: of the slots ndf, masking and fresnel, or of a diffuse model, with
-    directions drawn as `how` says, for `sets` sets of numbers."""
-    defines = f"#define {how}\n#define SETS {sets}\n"
-    # samples.cl makes reals of what special.clh calls bits: one macro, of either.
-    bound = defines + _bindings(slots, cells=(), area_terms=area_terms)
-    return _assemble(["real.clh", "sphere.clh", ("bindings", bound), *_models(slots, area_terms),
-                      ("between", "#undef TO_REAL\n"), "pyramid.cl", "samples.cl", "truth.cl"])
+    """Return the program of a cube's pyramid and the filtered importance sampling of it."""
+    return assembled("importance sampling")
 
 
 @_kept
 def overlap() -> Source:
-    """Exact areas of overlap, for level 0."""
-    return _assemble(["real.clh", "sphere.clh", "overlap.cl"])
+    """Return the program of exact areas of overlap, which makes level 0."""
+    return assembled("means over texels")
 
 
 def demo() -> Source:
-    """The built-in environment."""
-    return _assemble(["real.clh", "demo.cl"])
+    """Return the program of the built-in environment."""
+    return assembled("built-in environment")
 
 
 def yardstick() -> Source:
-    """What a device can do at most: multiply-adds and memory."""
-    return _assemble(["real.clh", "yardstick.cl"])
+    """Return the program that measures the limits of a device: multiply-adds and memory."""
+    return assembled("limits of a device")
