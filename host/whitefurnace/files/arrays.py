@@ -1,5 +1,8 @@
-"""Reads .npy and .npz files that anyone may have written: what their headers say allocates nothing until the file is
-known to hold it, and nothing in them is executed."""
+"""Reads .npy and .npz files, and arrays in C headers, from untrusted sources.
+
+No memory is allocated for a size that a header states until the file is known to hold that many bytes, and nothing in
+a file is executed.
+"""
 
 from __future__ import annotations
 
@@ -24,20 +27,23 @@ NPY, ZIP = b"\x93NUMPY", b"PK\x03\x04"
 _ARRAY = re.compile(r"static const (?:float|double) \w+((?:\[\d{1,9}\]){1,8}) = \{")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _DENSEST = 1032
-"""Bytes that a byte of deflated data can become at most [zlib: Maximum Expansion Factor]."""
+"""Largest number of bytes that one byte of deflated data can expand to [zlib: Maximum Expansion Factor]."""
 _READERS: dict[tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.dtype[Any]]]] = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
-# What numpy's parser of the header and zipfile raise for bytes that make no sense.
+# The exceptions that numpy's header parser and zipfile raise for malformed bytes.
 _NONSENSE = (ValueError, TypeError, SyntaxError, OverflowError, EOFError, MemoryError, RecursionError, LookupError,
              AttributeError, NotImplementedError, RuntimeError, tokenize.TokenError, struct.error, zlib.error,
              zipfile.BadZipFile, OSError)
 
 
 def read_npy(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
-    """The array of numbers in a .npy file. Raises `FileError`, and `InputError` for what is not valid or holds anything
-    but numbers."""
+    """Read the array of a .npy file.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for a file that is not valid or holds anything
+    but numbers.
+    """
     import io
 
     source = load(path)
@@ -45,7 +51,10 @@ def read_npy(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
-    """The arrays of a .npz file by name, in its order; every checksum is compared. Raises as `read_npy`."""
+    """Read the arrays of a .npz file, by name and in the file's order. Every checksum is verified.
+
+    Raises the same errors as `read_npy`.
+    """
     import io
 
     source = load(path)
@@ -71,8 +80,10 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
 
 
 def read_header(path: str | os.PathLike[str]) -> npt.NDArray[np.float64] | None:
-    """The array of floats in a C header, of the sizes that it states; None for one without such an array. Raises as
-    `read_npy`."""
+    """Read the array of floats in a C header, with the shape that the header declares.
+
+    Returns None for a header that has macros and no array. Raises the same errors as `read_npy`.
+    """
     source = load(path)
     try:
         text = bytes(source.view).decode()
@@ -92,7 +103,7 @@ def read_header(path: str | os.PathLike[str]) -> npt.NDArray[np.float64] | None:
 
 
 def is_arrays(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins as .npy does, or as .npz does and is named so."""
+    """Return whether a file is .npy by its first bytes, or .npz by its first bytes and its suffix."""
     try:
         with open(path, "rb") as file:
             head = file.read(6)
@@ -102,7 +113,7 @@ def is_arrays(path: str | os.PathLike[str]) -> bool:
 
 
 def _array(stream: BinaryIO, size: int, source: Source, what: str) -> npt.NDArray[Any]:
-    """The array of a stream of `size` bytes."""
+    """Parse the array in a stream of `size` bytes; `what` names the stream in error messages."""
     try:
         version = np.lib.format.read_magic(stream)
         if version not in _READERS:
@@ -126,4 +137,5 @@ def _array(stream: BinaryIO, size: int, source: Source, what: str) -> npt.NDArra
 
 
 def _said(error: BaseException) -> str:
+    """Return the text of an exception on one line of at most 120 characters."""
     return " ".join(str(error).split())[:120].rstrip(".") or type(error).__name__

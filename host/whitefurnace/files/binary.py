@@ -1,5 +1,7 @@
-"""Pieces of a file by offset and length, each checked against the file's real size before it is touched: what a header
-says allocates nothing."""
+"""Access to the bytes of a file by offset and length.
+
+Every access is checked against the file's real size first, so a wrong size in a header allocates no memory.
+"""
 
 from __future__ import annotations
 
@@ -14,11 +16,11 @@ from whitefurnace.errors import FileError, InputError
 Buffer = bytes | memoryview
 
 MAX_BYTES = 8 << 30
-"""No texture may be larger, in its file or unpacked."""
+"""Largest size of a texture, both in its file and unpacked."""
 
 
 class Source:
-    """The bytes of a file and the `name` that its errors begin with."""
+    """The bytes of a file. `name` begins the messages of its errors."""
 
     def __init__(self, data: Buffer, name: str) -> None:
         self.view = memoryview(data)
@@ -28,11 +30,14 @@ class Source:
         return len(self.view)
 
     def wrong(self, what: str) -> InputError:
-        """The error that says `what` of this file."""
+        """Return the error for an invalid file; `what` is the end of its sentence."""
         return InputError(f"{self.name} is not valid: {what}")
 
     def piece(self, offset: int, length: int, what: str) -> memoryview:
-        """`length` bytes from `offset`. Raises `InputError` where the file ends before."""
+        """Return `length` bytes from `offset`. Raises `InputError` where the file ends earlier.
+
+        `what` names the piece in the message.
+        """
         if offset < 0 or length < 0 or offset + length > len(self.view):
             raise InputError(
                 f"{self.name} is truncated or corrupted: {what} would take bytes {offset} to {offset + length}, the "
@@ -41,16 +46,18 @@ class Source:
         return self.view[offset : offset + length]
 
     def integers(self, form: str, offset: int, what: str) -> tuple[int, ...]:
-        """Little-endian integers of `struct`'s `form` from `offset`. Raises `InputError`."""
+        """Return the little-endian integers of the `struct` format `form` from `offset`. Raises `InputError`."""
         return struct.unpack("<" + form, self.piece(offset, struct.calcsize("<" + form), what))
 
 
 def load(path: str | os.PathLike[str]) -> Source:
-    """All of a regular file of at most 8 GiB. Raises `FileError` and, for one that is empty or too large,
-    `InputError`."""
+    """Read a whole regular file.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is empty or larger than 8 GiB.
+    """
     path = Path(path)
     try:
-        status = os.stat(path)  # before it is opened: a pipe would wait for its writer
+        status = os.stat(path)  # before opening: a pipe would block until it has a writer
         if stat.S_ISDIR(status.st_mode):
             raise FileError(f"cannot read {path}: it is a folder, a texture file was expected")
         if not stat.S_ISREG(status.st_mode):
@@ -68,7 +75,10 @@ def load(path: str | os.PathLike[str]) -> Source:
 
 
 def pack_key_values(pairs: Mapping[str, bytes]) -> bytes:
-    """Key-value data of KTX 1 and 2, sorted by the code points of the keys: size, key, NUL, value, padding to 4."""
+    """Encode the key-value data of KTX 1 and 2, sorted by the code points of the keys.
+
+    Each pair is its size, the key, a NUL, the value, and padding to a multiple of 4 bytes.
+    """
     out = bytearray()
     for key in sorted(pairs):
         if not key or "\0" in key:
@@ -79,7 +89,7 @@ def pack_key_values(pairs: Mapping[str, bytes]) -> bytes:
 
 
 def parse_key_values(source: Source, offset: int, length: int) -> dict[str, bytes]:
-    """Key-value data of KTX 1 and 2, values as they are stored. Raises `InputError`."""
+    """Parse the key-value data of KTX 1 and 2; values are returned as stored. Raises `InputError`."""
     source.piece(offset, length, "its key-value data")
     pairs: dict[str, bytes] = {}
     end = offset + length

@@ -1,4 +1,7 @@
-"""Textures of any container: read by what a file begins with, written by what its name ends with."""
+"""Reads and writes textures in KTX 1, KTX 2 and DDS.
+
+The first bytes of a file select the reader, the suffix of its name the writer.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,7 @@ _PARSERS = {ktx1.IDENTIFIER: ktx1.parse_ktx1, ktx2.IDENTIFIER: ktx2.parse_ktx2, 
 
 
 def is_texture(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins as KTX 1, KTX 2 or DDS does; false where it cannot be read."""
+    """Return whether a file is KTX 1, KTX 2 or DDS by its first bytes; False where it cannot be read."""
     try:
         if not Path(path).is_file():
             return False
@@ -27,12 +30,15 @@ def is_texture(path: str | os.PathLike[str]) -> bool:
 
 
 def read_texture(path: str | os.PathLike[str]) -> Texture:
-    """Read a KTX 1, KTX 2 or DDS file. Raises `FileError`, and `InputError` for what is none of them or not valid."""
+    """Read a KTX 1, KTX 2 or DDS file.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid or of another format.
+    """
     return parse_texture(load(path))
 
 
 def parse_texture(source: Source) -> Texture:
-    """The texture in the bytes of a KTX 1, KTX 2 or DDS file. Raises `InputError`."""
+    """Parse the bytes of a KTX 1, KTX 2 or DDS file. Raises `InputError`."""
     head = bytes(source.view[:12])
     for magic, parse in _PARSERS.items():
         if head.startswith(magic):
@@ -42,8 +48,12 @@ def parse_texture(source: Source) -> Texture:
 
 def write_texture(path: str | os.PathLike[str], texture: Texture, *, zstd: int | None = None,
                   into: Transaction | None = None) -> None:
-    """Write `texture` as .ktx, .ktx2 or .dds; `zstd` is for .ktx2. Raises `UnsupportedError` for another suffix or a
-    format that the container is not written in, `FileError` for what cannot be written."""
+    """Write `texture` as .ktx, .ktx2 or .dds, by the suffix of `path`.
+
+    zstd: level of Zstandard compression, 1 to 22, for .ktx2 alone. into: the transaction that the file belongs to.
+    Raises `UnsupportedError` for another suffix or a pixel format that the container cannot hold, and `FileError`
+    where the file cannot be written.
+    """
     suffix = Path(path).suffix.lower()
     if suffix == ".ktx2":
         ktx2.write_ktx2(path, texture, zstd=zstd, into=into)

@@ -1,5 +1,7 @@
-"""DDS with the DX10 header [Microsoft, Programming Guide for DDS; DDS_HEADER; DDS_HEADER_DXT10]. The older headers of
-the same float formats are read too."""
+"""Reads and writes DDS with the DX10 header [Microsoft, Programming Guide for DDS; DDS_HEADER; DDS_HEADER_DXT10].
+
+The older headers of the same float formats are read too.
+"""
 
 from __future__ import annotations
 
@@ -28,24 +30,30 @@ _TEXTURE2D, _MISC_CUBE = 3, 4
 
 
 def write_dds(path: str | os.PathLike[str], texture: Texture, *, into: Transaction | None = None) -> None:
-    """Write `texture` with the DX10 header; the same texture gives the same bytes. DDS has no key-values, they are left
-    out, and an array of one layer is none. Raises `UnsupportedError` for a format that DDS is not written in,
-    `FileError` for what cannot be written."""
+    """Write `texture` as DDS with the DX10 header; the same texture gives the same bytes.
+
+    DDS has no key-values, so they are left out. An array of one layer is written as a single texture.
+    Raises `UnsupportedError` for a pixel format that is not written to DDS, and `FileError` where the file cannot be
+    written.
+    """
     write_pieces(path, _pieces(texture), into)
 
 
 def dds_bytes(texture: Texture) -> bytes:
-    """The file as bytes. Raises `UnsupportedError`."""
+    """Return the bytes of the DDS file of `texture`. Raises `UnsupportedError`."""
     return b"".join(_pieces(texture))
 
 
 def read_dds(path: str | os.PathLike[str]) -> Texture:
-    """Read a 2-D or cube texture, or an array of them. Raises `FileError`, and `InputError` for what is not valid."""
+    """Read a DDS file with a 2-D texture, a cube, or an array of either.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid.
+    """
     return parse_dds(load(path))
 
 
 def parse_dds(source: Source) -> Texture:
-    """The texture in the bytes of a file. Raises `InputError` for what is not valid."""
+    """Parse the bytes of a DDS file. Raises `InputError` where they are not valid."""
     if source.piece(0, 4, "the DDS magic number") != MAGIC:
         raise source.wrong("it does not begin with the magic number of DDS")
     header = source.integers("31I", 4, "the DDS header")
@@ -111,7 +119,7 @@ def _file(texture: Texture) -> Iterator[Buffer]:
     if texture.cube:
         caps |= _CAPS_COMPLEX
         caps2 = _CAPS2_CUBE | _CAPS2_FACES
-    # of a row of level 0, or of its whole image where it is of blocks
+    # Bytes of a row of level 0; for block formats, bytes of the whole image.
     pitch = level_bytes(texture.format, texture.width, texture.height if kind.block > 1 else 1, 0)
     yield MAGIC + struct.pack("<31I", 124, flags, texture.height, texture.width, pitch, 0, count, *[0] * 11,
                               32, _FOURCC, _DX10, 0, 0, 0, 0, 0, caps, caps2, 0, 0, 0)

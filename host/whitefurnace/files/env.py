@@ -1,5 +1,7 @@
-"""Babylon.js `.env` environments, as @babylonjs/core 9 (Misc/environmentTextureTools) writes and reads them: a magic
-number, a JSON manifest with a NUL at its end, and images of RGBD cube faces, mip by mip."""
+"""Reads and writes Babylon.js `.env` environments, as @babylonjs/core 9 (Misc/environmentTextureTools) does.
+
+The file is a magic number, a JSON manifest that ends with a NUL, and images of RGBD cube faces, mip by mip.
+"""
 
 from __future__ import annotations
 
@@ -26,16 +28,20 @@ _IMAGE_TYPES = ("image/png", "image/webp")
 
 @dataclass(frozen=True, eq=False)
 class EnvMap:
-    """What an `.env` holds. `levels[k]` is float32 (6, n >> k, n >> k, 3), GL-direct (the texel for direction d is what
-    `textureCube(d)` returns in the engine), all of them down to one texel; r is read at `lod_scale`·log2(n·r²).
+    """The contents of an `.env` file.
 
-    `polynomials` (9, 3) are the rows x y z xx yy zz yz zx xy of P(n) = x·n.x + … + xx·n.x² + …, or None, and then the
-    engine makes its own of the levels. Materials with `brdf.useSphericalHarmonics` false show P(n) as E/π. By default
-    it is true, and they show P with its part of l = 1 times 3/2 and that of l = 2 times 4 (`preScaledHarmonics` leaves
-    out the cosine's 2/3 and 1/4), which the engine's own files have divided out before.
+    `levels[k]` is float32 (6, n >> k, n >> k, 3), the complete chain down to one texel. Its faces are GL-direct: the
+    texel for direction d is the one that `textureCube(d)` returns in the engine. The engine reads roughness r at level
+    `lod_scale`·log2(n·r²).
 
-    `irradiance` (6, m, m, 3) is E/π as a cube, used instead of P by materials that can; `dominant` beside it is the
-    direction of the strongest light, or None."""
+    `polynomials` (9, 3) are the rows x y z xx yy zz yz zx xy of P(n) = x·n.x + … + xx·n.x² + …. Where they are None
+    the engine computes its own from the levels. Materials with `brdf.useSphericalHarmonics` false show P(n) as E/π.
+    By default it is true, and materials show P with its part of l = 1 times 3/2 and its part of l = 2 times 4, because
+    `preScaledHarmonics` omits the cosine's 2/3 and 1/4. The engine's own files have these factors divided out.
+
+    `irradiance` (6, m, m, 3) is E/π as a cube, which newer materials use in place of P. `dominant` is the direction of
+    the strongest light, or None; it is stored with `irradiance` alone.
+    """
 
     levels: tuple[Level, ...]
     polynomials: npt.NDArray[np.float64] | None = None
@@ -61,19 +67,21 @@ class EnvMap:
 
 
 def write_env(path: str | os.PathLike[str], envmap: EnvMap, *, into: Transaction | None = None) -> tuple[int, int]:
-    """Write version 2 with PNG; the same map gives the same bytes. Returns how many values were clipped to 255, the
-    most that RGBD holds, and how many negative ones became 0. Raises `InputError` for NaN, `FileError` for what cannot
-    be written."""
+    """Write `envmap` as `.env` version 2 with PNG images; the same map gives the same bytes.
+
+    Returns the number of values clipped to 255, the largest that RGBD holds, and the number of negative values set
+    to 0. Raises `InputError` for NaN, and `FileError` where the file cannot be written.
+    """
     data, clipped, negative = env_bytes(envmap)
     write_pieces(path, [data], into)
     return clipped, negative
 
 
 def env_bytes(envmap: EnvMap) -> tuple[bytes, int, int]:
-    """The file as bytes, and what `write_env` returns. Raises `InputError` for NaN."""
+    """Return the bytes of the file and the two counts of `write_env`. Raises `InputError` for NaN."""
     if envmap.irradiance is not None and envmap.polynomials is None:
-        # Babylon would write zeros, which leave every material black that does not read the cube.
-        raise ValueError("irradiance as a cube needs the polynomials beside it")
+        # Babylon would write zeros, and materials that do not read the cube would be black.
+        raise ValueError("irradiance as a cube needs polynomials too")
     places: list[dict[str, int]] = []
     blobs: list[bytes] = []
     at = clipped = negative = 0
@@ -101,20 +109,22 @@ def env_bytes(envmap: EnvMap) -> tuple[bytes, int, int]:
 
 
 def read_env(path: str | os.PathLike[str]) -> EnvMap:
-    """Read version 1 or 2, decoded as the engine decodes. Raises `FileError`, and `InputError` for what is not
-    valid."""
+    """Read an `.env` file of version 1 or 2 and decode it as the engine does.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid.
+    """
     return parse_env(load(path))
 
 
 def parse_env(source: Source) -> EnvMap:
-    """The map in the bytes of a file. Raises `InputError` for what is not valid."""
+    """Parse the bytes of an `.env` file. Raises `InputError` where they are not valid."""
     if source.piece(0, len(MAGIC), "the magic number of an .env") != MAGIC:
         raise source.wrong("it does not begin with the magic number of a Babylon.js .env")
     head = bytes(source.view[len(MAGIC) : len(MAGIC) + _MAX_MANIFEST])
     length = head.find(b"\0")
     if length < 0:
         raise source.wrong(f"its manifest does not end within {len(head)} bytes")
-    # Byte by byte, as the engine takes it.
+    # The engine reads the manifest byte by byte, which is Latin-1.
     manifest = parse_object(source, head[:length].decode("latin-1"), "its manifest")
     start = len(MAGIC) + length + 1
     take = Reader(source)
@@ -146,7 +156,7 @@ def parse_env(source: Source) -> EnvMap:
             x, y, z = take.rows([texture["dominantDirection"]], "dominantDirection", 1)[0].tolist()
             dominant = x, y, z
     for (first, bytes_there), (second, _) in zip(sorted(spans), sorted(spans)[1:], strict=False):
-        if first + bytes_there > second:  # each texel that is unpacked was in the file
+        if first + bytes_there > second:  # else a small file could unpack to any size
             raise source.wrong(f"its images overlap at byte {second}, each must have bytes of its own")
 
     sides = [width >> k // 6 for k in range(6 * count)] + [side] * 6
@@ -161,7 +171,7 @@ def parse_env(source: Source) -> EnvMap:
 
 
 def _spans(take: Reader, value: Any, what: str, count: int, start: int) -> list[tuple[int, int]]:
-    """Offset in the file and length of each image."""
+    """Return the offset in the file and the length of each of `count` images."""
     most = len(take.source)
     out = []
     for k, entry in enumerate(take.array(value, what, count, count)):

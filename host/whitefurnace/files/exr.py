@@ -1,4 +1,4 @@
-"""Writes float32 OpenEXR files and proves, before they take their name, that they hold what was given."""
+"""Writes float32 OpenEXR files, and reads each back to verify it before it gets its name."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction, write_atomic
 
 ROWS_AT_ONCE = 1 << 24
-"""Bytes of rows that are handed over at once."""
+"""Bytes of pixel rows passed to OpenImageIO in one call."""
 
 
 def write_exr(
@@ -24,11 +24,12 @@ def write_exr(
     attributes: Mapping[str, str | float | int] | None = None,
     into: Transaction | None = None,
 ) -> None:
-    """Write `pixels` (height, width, channels) as 32-bit floats, ZIP compressed: half would turn values over
-    65504 into inf in silence. The same input gives the same bytes, with no time in them.
+    """Write `pixels` (height, width, channels) as 32-bit floats, ZIP compressed.
 
-    `channel_names` has one name a channel. The file is read back and compared bit for bit before it is
-    renamed. Raises `FileError` for what cannot be written, a full disk too.
+    Half floats would silently turn values over 65504 into inf. The same input gives the same bytes: no time is stored.
+    The file is read back and compared bit for bit before it is renamed.
+    channel_names: one name for each channel. attributes: header attributes by name.
+    Raises `FileError` where the file cannot be written, for example on a full disk.
     """
     path = Path(path)
     pixels = np.ascontiguousarray(pixels, np.float32)
@@ -38,7 +39,7 @@ def write_exr(
         )
 
     def write(temporary: Path) -> None:
-        # Tried first for the system's own reason, which OpenImageIO does not pass on.
+        # Open the file here first: OpenImageIO does not pass on the system's reason for a failure.
         with open(temporary, "wb"):
             pass
         try:
@@ -61,23 +62,25 @@ def _write(
     names: Sequence[str],
     attributes: Mapping[str, str | float | int],
 ) -> str | None:
-    """None, or what went wrong. On return the output object is gone: only its destructor completes some
-    files."""
+    """Write the file with OpenImageIO; return None, or the reason of a failure.
+
+    The output object is deleted before the return, because only its destructor completes some files.
+    """
     import OpenImageIO as oiio
 
     height, width, channels = pixels.shape
     spec = oiio.ImageSpec(width, height, channels, "float")
     spec.channelnames = tuple(names)
     spec.attribute("compression", "zip")
-    spec.attribute("DateTime", "")  # empty is left out; absent, OpenImageIO writes the time of day
+    spec.attribute("DateTime", "")  # an empty one is not written; without it OpenImageIO writes the current time
     for name, value in attributes.items():
         spec.attribute(name, value)
-    # By format: the temporary's suffix says nothing.
+    # Named by format, because the temporary file has another suffix.
     output = oiio.ImageOutput.create("openexr")
     if output is None:
         return _first_line(oiio.geterror())
     done = output.open(str(path), spec)
-    # A whole number of ZIP's 16 rows at a time: in one go OpenImageIO takes several times the image's memory.
+    # Multiples of ZIP's 16 rows: writing all rows at once takes several times the image's memory.
     step = 16 * max(ROWS_AT_ONCE // (64 * width * channels), 1)
     for y in range(0, height, step):
         done = done and output.write_scanlines(y, min(y + step, height), 0, pixels[y : y + step])
@@ -90,6 +93,7 @@ def _write(
 
 
 def _holds(path: Path, pixels: npt.NDArray[np.float32]) -> bool:
+    """Return whether the file reads back as exactly these bits."""
     import OpenImageIO as oiio
 
     source = oiio.ImageInput.open(str(path))

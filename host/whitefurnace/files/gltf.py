@@ -1,5 +1,8 @@
-"""What a .glb or .gltf holds, as far as it can be trusted: its JSON, buffers, accessors and images, each checked
-against the bytes that are there before anything is allocated. Meaning is `whitefurnace.scenes.materials`'s."""
+"""Reads the JSON, buffers, accessors and images of .glb and .gltf files from untrusted sources.
+
+Every size is checked against the bytes in the file before memory is allocated. `whitefurnace.scenes.materials`
+interprets the contents.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,10 @@ from whitefurnace.files.jsontext import Reader
 from whitefurnace.files.png import _scratch_file
 
 MAX_VALUES = 4_000_000
-"""Values of a file's JSON, by its commas and brackets: as Python objects they take a few hundred megabytes."""
+"""Largest number of values in a file's JSON, counted by commas and brackets: a few hundred megabytes in Python."""
 
 MAX_ELEMENTS = 1 << 26
-"""Of an accessor that is read: as float64 pairs a gigabyte."""
+"""Largest number of elements in an accessor: as pairs of float64 they take a gigabyte."""
 
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -35,10 +38,10 @@ Codes = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
 class Gltf:
-    """An opened glTF: `document` is its JSON, `take` reads values of it with their kind and range."""
+    """An opened glTF file. `document` is its JSON; `take` reads values of it and checks their type and range."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        """Raises `FileError` for what cannot be read, `InputError` for what is no glTF 2."""
+        """Open the file. Raises `FileError` where it cannot be read, and `InputError` where it is not glTF 2."""
         self.path = Path(path)
         self.source = load(path)
         self.take = Reader(self.source)
@@ -51,12 +54,12 @@ class Gltf:
         self._pieces = _Images(self.take, self.document, binary, self.path.parent)
 
     def objects(self, name: str, most: int) -> list[dict[str, Any]]:
-        """An array of objects at the top of the document, empty where there is none."""
+        """Return an array of at most `most` objects at the top of the document; empty where it is missing."""
         found = self.take.array(self.document.get(name, []), name, 0, most)
         return [self.take.object(one, f"{name}[{k}]") for k, one in enumerate(found)]
 
     def index(self, value: Any, count: int, what: str) -> int:
-        """A number of one of `count` things."""
+        """Check that `value` is an index below `count`. Raises `InputError`."""
         if not count:
             raise self.source.wrong(f"{what} is {value!r:.40}, there is none")
         return self.take.whole(value, what, 0, count - 1)
@@ -64,8 +67,11 @@ class Gltf:
     # ---------------------------------------------------------------------------------------- accessors
 
     def accessor(self, k: int, types: tuple[str, ...], what: str) -> npt.NDArray[Any] | None:
-        """(count, n) of an accessor, normalized integers as floats; None for what is compressed or sparse, and is not
-        read. Raises `InputError` where it is of another type or reaches beyond its buffer."""
+        """Return the values of accessor k, (count, n); normalized integers become floats.
+
+        Returns None for compressed and sparse accessors, which are not read. Raises `InputError` where the accessor is
+        not of one of `types` or reaches beyond its buffer.
+        """
         accessors = self.take.array(self.document.get("accessors", []), "accessors", 0, 1 << 20)
         name = f"accessor {self.index(k, len(accessors), what)}"
         one = self.take.object(accessors[k], name)
@@ -94,7 +100,7 @@ class Gltf:
         return values
 
     def _view(self, value: Any, what: str) -> tuple[memoryview, int] | None:
-        """Bytes and stride (0: packed) of a bufferView, None for a compressed one."""
+        """Return the bytes and the stride (0: packed) of a bufferView; None for a compressed one."""
         views = self._pieces._views
         k = self.index(value, len(views), f"the bufferView of {what}")
         name = f"bufferView {k}"
@@ -114,7 +120,7 @@ class Gltf:
         stated = self.take.whole(buffer.get("byteLength"), f"byteLength of buffer {k}", 1, 1 << 40)
         try:
             data = self._pieces._buffer(k)
-        except FileError as error:  # a scene without its buffers is no scene
+        except FileError as error:  # a scene without its buffers is not valid
             raise self.source.wrong(f"buffer {k} is missing: {error}") from None
         if stated > len(data):
             raise self.source.wrong(f"buffer {k} should have {stated} bytes, {len(data)} are there")
@@ -123,8 +129,11 @@ class Gltf:
     # ---------------------------------------------------------------------------------------- images
 
     def bands(self, k: int, what: str) -> Iterator[tuple[int, int, int, Codes]]:
-        """Image k as stored, in bands of rows: (height, width, first row, codes (rows, width, 4)) of 8 or 16 bits;
-        grey is in all three, and without an alpha that is the largest code. Raises `InputError`."""
+        """Read the codes of image k in bands of rows: (height, width, first row, codes (rows, width, 4)).
+
+        The codes have 8 or 16 bits. Grey fills all three colours, and a missing alpha is the largest code.
+        Raises `InputError`.
+        """
         image = self.take.object(self._pieces._images[self.index(k, len(self._pieces._images), what)], f"image {k}")
         try:
             data = self._pieces._bytes(k)
@@ -149,7 +158,7 @@ class Gltf:
 
 
 def _check_amount(source: Source) -> None:
-    """Refuses JSON of so many values that as objects they would not fit."""
+    """Refuse JSON with more values than fit in memory as Python objects."""
     view = source.view
     if bytes(view[:4]) == GLB_MAGIC and len(view) >= 20:
         view = view[20 : 20 + int.from_bytes(view[12:16], "little")]
@@ -193,6 +202,7 @@ def _decoded(path: Path, size: int) -> Iterator[tuple[int, int, int, Codes]]:
 
 
 def _four(codes: Codes) -> Codes:
+    """Extend codes of 1 to 4 channels to RGBA."""
     channels = codes.shape[2]
     out = np.full((*codes.shape[:2], 4), np.iinfo(codes.dtype).max, codes.dtype)
     out[..., :3] = codes[..., :1] if channels < 3 else codes[..., :3]

@@ -1,8 +1,11 @@
-"""glTF's EXT_lights_image_based [KhronosGroup/glTF, extensions/2.0/Vendor/EXT_lights_image_based]: a prefiltered cube
-as RGBD faces in PNG, and irradiance as nine coefficients. Written as one .gltf; .gltf and .glb of others are read.
+"""Reads and writes glTF's EXT_lights_image_based [KhronosGroup/glTF, extensions/2.0/Vendor/EXT_lights_image_based].
 
-The extension wants every image "flipped about its vertical axis to correspond with the way glTF references texture
-space"; what its loader in Babylon.js undoes is rows from the bottom up, and so they are written and read here."""
+A light is a prefiltered cube as RGBD faces in PNG, and irradiance as nine coefficients. Lights are written as one
+.gltf with the images inside; .gltf and .glb files of other programs are read too.
+
+The extension asks for every image "flipped about its vertical axis to correspond with the way glTF references texture
+space". Its loader in Babylon.js expects rows from the bottom up, so rows are written and read in that order.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +39,14 @@ _DATA = "data:"
 
 @dataclass(frozen=True, eq=False)
 class GltfLight:
-    """One light. `levels[k]` is float32 (6, n >> k, n >> k, 3), GL-direct, r = k/(levels − 1); they may stop before one
-    texel (near 16), an engine reads none of the mips that follow. `coefficients` (9, 3) are of irradiance, A_l·L_lm
-    with A = π, 2π/3, π/4, in the order L00 L1−1 L10 L11 L2−2 L2−1 L20 L21 L22; Babylon.js 9 takes them with the sign
-    (−1)^m of Condon and Shortley, of which the extension says nothing. `rotation` is a quaternion x y z w."""
+    """One image-based light.
+
+    `levels[k]` is float32 (6, n >> k, n >> k, 3), GL-direct, for roughness r = k/(levels − 1). The chain may stop
+    before one texel (near 16); engines read no mips after its last level. `coefficients` (9, 3) are those of
+    irradiance, A_l·L_lm with A = π, 2π/3, π/4, in the order L00 L1−1 L10 L11 L2−2 L2−1 L20 L21 L22. Babylon.js 9
+    expects the sign (−1)^m of Condon and Shortley in them, which the extension does not specify. `rotation` is a
+    quaternion x y z w.
+    """
 
     levels: tuple[Level, ...]
     coefficients: npt.NDArray[np.float64]
@@ -61,16 +68,18 @@ class GltfLight:
 
 def write_gltf_lights(path: str | os.PathLike[str], light: GltfLight | Sequence[GltfLight], *,
                       into: Transaction | None = None) -> tuple[int, int]:
-    """Write a .gltf with the images in it, the scene k lit by light k; the same lights give the same bytes. Returns how
-    many values were clipped to 255, the most that RGBD holds, and how many negative ones became 0. Raises `InputError`
-    for NaN, `FileError` for what cannot be written."""
+    """Write one .gltf with the images inside; scene k is lit by light k. The same lights give the same bytes.
+
+    Returns the number of values clipped to 255, the largest that RGBD holds, and the number of negative values set
+    to 0. Raises `InputError` for NaN, and `FileError` where the file cannot be written.
+    """
     text, clipped, negative = gltf_text([light] if isinstance(light, GltfLight) else light)
     write_pieces(path, [text.encode("ascii")], into)
     return clipped, negative
 
 
 def gltf_text(lights: Sequence[GltfLight]) -> tuple[str, int, int]:
-    """The file as a text, and what `write_gltf_lights` returns. Raises `InputError` for NaN."""
+    """Return the text of the file and the two counts of `write_gltf_lights`. Raises `InputError` for NaN."""
     if not 1 <= len(lights) <= MAX_LIGHTS:
         raise ValueError(f"there are {len(lights)} lights, 1 to {MAX_LIGHTS} are written")
     images: list[dict[str, str]] = []
@@ -86,7 +95,7 @@ def gltf_text(lights: Sequence[GltfLight]) -> tuple[str, int, int]:
         entries.append({
             **({"name": light.name} if light.name else {}),
             "rotation": list(light.rotation),
-            "intensity": light.intensity,  # Babylon.js multiplies by it even where it is not given, and gets NaN
+            "intensity": light.intensity,  # always written: without it Babylon.js multiplies by undefined, which is NaN
             "irradianceCoefficients": np.asarray(light.coefficients, np.float64).tolist(),
             "specularImageSize": light.size,
             "specularImages": mips,
@@ -103,14 +112,20 @@ def gltf_text(lights: Sequence[GltfLight]) -> tuple[str, int, int]:
 
 
 def read_gltf_lights(path: str | os.PathLike[str]) -> tuple[GltfLight, ...]:
-    """The lights of a .gltf or .glb, whose images and buffers may be in it or in files of its folder. Raises
-    `FileError`, and `InputError` for what is not valid, has no such light or names a file outside its folder."""
+    """Read the lights of a .gltf or .glb, whose images and buffers are in the file or in files of its folder.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid, has no image-based
+    light, or refers to a file outside its folder.
+    """
     return parse_gltf_lights(load(path), Path(path).parent)
 
 
 def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfLight, ...]:
-    """The lights in the bytes of a file; files beside it are read from `folder`, and refused where it is None. Raises
-    `FileError` and `InputError`."""
+    """Parse the lights in the bytes of a file.
+
+    Other files that it refers to are read from `folder`, and refused where that is None. Raises `FileError` and
+    `InputError`.
+    """
     document, binary = _document(source)
     take = Reader(source)
     extension = take.object(document.get("extensions", {}), "extensions").get(NAME)
@@ -140,7 +155,7 @@ def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfL
 
 
 def _entry(take: Reader, entry: Any, what: str) -> tuple[dict[str, Any], int, list[Any]]:
-    """A light of the file, the side of its level 0 and its mips."""
+    """Return the JSON of a light, the side of its level 0 in texels, and its mips."""
     light = take.object(entry, what)
     size = take.whole(light.get("specularImageSize"), f"specularImageSize of {what}", 1, MAX_SIZE)
     if size & (size - 1):
@@ -149,7 +164,7 @@ def _entry(take: Reader, entry: Any, what: str) -> tuple[dict[str, Any], int, li
 
 
 def _document(source: Source) -> tuple[dict[str, Any], memoryview | None]:
-    """The JSON of a .gltf or .glb and the binary chunk of the latter."""
+    """Return the JSON of a .gltf or .glb, and the binary chunk of a .glb."""
     if bytes(source.view[:4]) != GLB_MAGIC:
         if len(source) > _MAX_JSON:
             raise source.wrong(f"it has {len(source)} bytes, JSON of glTF has at most {_MAX_JSON}")
@@ -188,7 +203,7 @@ def _json(source: Source, data: memoryview) -> dict[str, Any]:
 
 
 class _Images:
-    """Images by index, decoded once; buffers and files are loaded once."""
+    """Images of a glTF by index. Each image is decoded once, and each buffer or file is loaded once."""
 
     def __init__(self, take: Reader, document: Mapping[str, Any], binary: memoryview | None,
                  folder: Path | None) -> None:
@@ -200,7 +215,7 @@ class _Images:
         self._loaded: dict[int, memoryview] = {}
 
     def face(self, index: Any, side: int, what: str) -> Level:
-        """The image that `what` names, as a face of side x side."""
+        """Return image `index` as a face of side x side texels; `what` names the face in error messages."""
         k = self._index(index, len(self._images), "image", what)
         if (k, side) not in self._faces:
             piece = Source(self._bytes(k), f"{self._source.name}, image {k} ({what}),")
@@ -240,7 +255,7 @@ class _Images:
         return self._loaded[k]
 
     def _uri(self, value: Any, what: str) -> memoryview:
-        """What a data URI holds, or a file in the folder of the glTF."""
+        """Return the bytes of a data URI, or of a file in the folder of the glTF."""
         uri = self._take.text(value, f"the uri of {what}")
         if uri[: len(_DATA)].lower() == _DATA:
             head, comma, body = uri.partition(",")
@@ -253,8 +268,11 @@ class _Images:
         return load(self._file(unquote(uri), what)).view
 
     def _file(self, name: str, what: str) -> Path:
-        """A path in the folder. Neither a scheme nor an absolute path, not upwards and not through a link that leads
-        out: a glTF from anywhere must not tell what else is on the disk."""
+        """Return the path of a file in the folder of the glTF.
+
+        Schemes, absolute paths, paths upwards and links out of the folder are refused: an untrusted glTF must not
+        reveal other files of the disk.
+        """
         shown = name[:60].encode("ascii", "backslashreplace").decode()
         outside = self._source.wrong(f"the uri of {what}, {shown!r}, is not a file in the folder of the glTF")
         if self._folder is None or not name or not name.isprintable() or name[0] in "/\\" or set(name) & set(":\\"):

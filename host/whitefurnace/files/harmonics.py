@@ -1,5 +1,7 @@
-"""Nine RGB coefficients as the small texts that engines and tools pass around: a line for each, `( r, g, b); // name`,
-or JSON by name."""
+"""Reads nine RGB coefficients of spherical harmonics from the text files that engines and tools exchange.
+
+The text has one line for each coefficient, `( r, g, b); // name`, or is JSON by name.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,11 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
 def read_sh(path: str | os.PathLike[str]) -> npt.NDArray[np.float64]:
-    """The (9, 3) numbers of a .txt or .json, in the order in which they stand. Raises `FileError`, and `InputError` for
-    what is not nine lines, or nine names, of three finite numbers."""
+    """Read the (9, 3) numbers of a .txt or .json file, in the order of the file.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that does not have nine lines, or nine
+    names, of three finite numbers.
+    """
     source = load(path)
     if len(source) > _MAX_BYTES:
         raise source.wrong(f"it has {len(source)} bytes, nine rows of numbers have fewer than {_MAX_BYTES}")

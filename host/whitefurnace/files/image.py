@@ -1,5 +1,7 @@
-"""Reads one image of any format OpenImageIO knows into linear Rec.709 float32, and turns whatever is wrong
-with it (missing, truncated, corrupted, lying about its size) into one sentence."""
+"""Reads an image of any format of OpenImageIO as linear Rec.709 float32.
+
+A file that is missing, truncated, corrupted or has a wrong size in its header raises an error of one sentence.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +23,9 @@ from whitefurnace.files.integrity import check_file
 MAX_PIXELS = 32768 * 16384
 MAX_SIDE = 65536
 _CHUNK_BYTES = 8 << 20
-# The densest coding of flat TIFF, PNG and JPEG images is near 1365 : 1 (LZW); a header that claims more lies.
+# The densest coding of flat TIFF, PNG and JPEG images is near 1365 : 1 (LZW); a header that claims more is wrong.
 _MAX_RATIO = 2000
-# `null` makes up an image from a file's name, `zfile` holds depth.
+# Formats of OpenImageIO that are no images: `null` makes one from a file's name, `zfile` holds depth.
 _NOT_IMAGES = ("null", "zfile", "term")
 _REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
@@ -31,9 +33,14 @@ _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0
 
 @dataclass(frozen=True)
 class Image:
-    """An image as read. `pixels` is float32 (height, width, channels), row 0 on top, channels 1 (grey), 3
-    (RGB) or 4 (RGB and coverage), linear Rec.709 radiance; `digest` the sha256 of the file's bytes in hex;
-    `format` OpenImageIO's name of the format; `notices` sentences about what was converted or left out."""
+    """An image that was read.
+
+    pixels   float32 (height, width, channels), linear Rec.709 radiance, row 0 on top; 1 channel (grey), 3 (RGB) or
+             4 (RGB and coverage)
+    digest   sha256 of the file's bytes, in hex
+    format   OpenImageIO's name of the file format
+    notices  sentences about conversions and about data that was left out
+    """
 
     pixels: npt.NDArray[np.float32]
     path: Path
@@ -44,8 +51,7 @@ class Image:
 
 @cache
 def srgb_table(dtype: str) -> npt.NDArray[np.float32]:
-    """Linear value of every code of an sRGB-encoded `dtype` ("uint8" or "uint16"): float32 (256,) or
-    (65536,)."""
+    """Return the linear value of every sRGB code of `dtype` ("uint8" or "uint16"): float32 (256,) or (65536,)."""
     top = np.iinfo(dtype).max
     encoded = np.arange(top + 1, dtype=np.float64) / top
     # IEC 61966-2-1: a linear toe below 0.04045, a power of 2.4 above.
@@ -56,8 +62,10 @@ def srgb_table(dtype: str) -> npt.NDArray[np.float32]:
 def decode_srgb(
     codes: npt.NDArray[Any], out: npt.NDArray[np.float32] | None = None
 ) -> npt.NDArray[np.float32]:
-    """Decode uint8 or uint16 `codes` (..., 1 | 3 | 4) from sRGB to linear float32; a fourth channel is
-    divided by its largest code instead. `out` takes the result where given."""
+    """Decode uint8 or uint16 `codes` (..., 1 | 3 | 4) from sRGB to linear float32.
+
+    A fourth channel is not decoded but divided by its largest code. `out` receives the result where it is given.
+    """
     if out is None:
         out = np.empty(codes.shape, np.float32)
     np.take(srgb_table(codes.dtype.name), codes[..., :3], out=out[..., :3], mode="clip")
@@ -69,10 +77,10 @@ def decode_srgb(
 def read_image(path: str | os.PathLike[str]) -> Image:
     """Read an image as linear Rec.709 float32.
 
-    8- and 16-bit integers are decoded from sRGB (a fourth channel is not), floats are taken as linear; an EXR
-    or HDR with other primaries is converted, with Bradford adaptation of its white. Extra channels are left
-    out with a notice. Raises `FileError` for what cannot be opened and `InputError` for what is not a valid
-    image of 1, 3 or 4 channels with at most 32768 x 16384 pixels and 65536 a side.
+    Integers of 8 and 16 bits are decoded from sRGB, except a fourth channel; floats are taken as linear. An EXR or HDR
+    with other primaries is converted, with Bradford adaptation of its white. Extra channels are left out with a
+    notice. Raises `FileError` for a file that cannot be opened, and `InputError` for one that is not a valid image of
+    1, 3 or 4 channels with at most 32768 x 16384 pixels and 65536 a side.
     """
     path = Path(path)
     size = _regular_size(path)
@@ -83,7 +91,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         return _read(path, size, digest)
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeError as error:  # channel names and the like
+    except UnicodeError as error:  # for example in the name of a channel
         raise InputError(f"{path} is corrupted: its header holds text that is not UTF-8") from error
     except MemoryError as error:
         raise InputError(f"{path} needs more memory than this machine gives") from error
@@ -113,14 +121,14 @@ def _read(path: Path, size: int, digest: str) -> Image:
         head = file.read(4096)
     check_file(path, size, head, notices)
 
-    # Values as stored: coverage is kept beside the colour, not multiplied into it.
+    # Read values as stored: colour is not multiplied by coverage.
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     try:
         source = oiio.ImageInput.open(str(path), hints)
     except (UnicodeError, TypeError) as error:  # a name that is not Unicode is no string to the binding
         raise FileError(f"cannot read {str(path)!r}: its name is not valid Unicode") from error
-    complaint = _complaint(oiio)  # left there, it is printed at exit
+    complaint = _complaint(oiio)  # fetched even without a failure: else it is printed at exit
     if source is None:
         if "could not find a format reader" in complaint or not complaint:
             raise InputError(
@@ -142,7 +150,7 @@ def _decode(source: Any, path: Path, size: int, digest: str, head: bytes, notice
     _check_size(spec, path, size, form)
     picks = _pick_channels(list(spec.channelnames), path, form, notices)
     pixel = str(spec.format)
-    # Channels of an EXR may differ in type; what is read is the first one's, which `read` converts to.
+    # Channels of an EXR may differ in type; OpenImageIO converts all to the type of the first.
     if pixel not in ("uint8", "uint16", "half", "float", "double"):
         raise InputError(
             f"{path} has pixels of type {pixel}, 8- or 16-bit unsigned integers or floats were expected"
@@ -204,7 +212,7 @@ def _check_size(spec: Any, path: Path, size: int, form: str) -> None:
 
 
 def _pick_channels(names: list[str], path: Path, form: str, notices: list[str]) -> list[int]:
-    """The channels to read: R, G, B and A by name, else Y, else the file's own 1, 3 or 4."""
+    """Return the indices of the channels to read: R, G, B and A by name, else Y, else all where there are 1, 3 or 4."""
     found: dict[str, int] = {}
     for index, name in enumerate(names):
         found.setdefault(name.upper(), index)
@@ -233,15 +241,18 @@ def _pick_channels(names: list[str], path: Path, form: str, notices: list[str]) 
 
 
 def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: str) -> npt.NDArray[np.float32]:
-    """The display window, (height, width, len(picks)). Read in bands of rows: a page of `out` is committed
-    only once its rows were there, so that a header that lies costs nothing."""
+    """Read the display window, (height, width, len(picks)).
+
+    Rows are read in bands, so that memory of `out` is committed only for rows that the file holds; a header with a
+    wrong size takes no memory.
+    """
     first, last = min(picks), max(picks) + 1
     columns = slice(spec.full_x - spec.x, spec.full_x - spec.x + spec.full_width)
     begin, end = spec.full_y, spec.full_y + spec.full_height
     out = np.empty((end - begin, spec.full_width, len(picks)), np.float32)
     kind = pixel if pixel in ("uint8", "uint16") else "float"
     tile = spec.tile_height if spec.tile_width else 0
-    # Whole compressed blocks: 256 rows is the largest of EXR's (DWAB); tiles have their own.
+    # Bands are whole compressed blocks; the largest of EXR has 256 rows (DWAB). Tiles have their own height.
     unit = tile or max(1, min(int(spec.get_int_attribute("oiio:RowsPerChunk", 1)), 256))
     rows = unit * max(1, _CHUNK_BYTES // (spec.width * (last - first) * 4 * unit))
     order = [pick - first for pick in picks]
@@ -255,7 +266,7 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
             )
         else:
             band = source.read_scanlines(0, 0, y, stop, spec.z, first, last, kind)
-        # JPEG fills what is missing with grey and only complains.
+        # OpenImageIO fills missing parts of a JPEG with grey and only sets an error message.
         if band is None or source.has_error:
             raise InputError(f"{path} is truncated or corrupted: {_reason(_complaint(source), path)}")
         band = np.asarray(band).reshape(stop - y, spec.width, last - first)
@@ -265,7 +276,7 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
         part = out[max(y, begin) - begin : min(stop, end) - begin]
         if kind == "float":
             if part.shape == out.shape and band.dtype == np.float32 and band.flags.c_contiguous:
-                return band  # the whole image at once: nothing to put together
+                return band  # one band holds the whole image
             part[...] = band
         else:
             decode_srgb(band, part)
@@ -273,12 +284,12 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
 
 
 def _primaries(spec: Any, form: str, head: bytes) -> tuple[float, ...] | None:
-    """CIE xy of red, green, blue and white where the file states them."""
+    """Return the CIE xy of red, green, blue and white that the file states, or None."""
     if form == "openexr":
         stated = spec.getattribute("chromaticities")
         if stated is not None and len(stated) == 8:
             return tuple(float(value) for value in stated)
-    if form == "hdr":  # OpenImageIO does not look at this line
+    if form == "hdr":  # OpenImageIO does not read this line
         for line in head.split(b"\n\n")[0].split(b"\n"):
             if line.startswith(b"PRIMARIES="):
                 try:
@@ -298,9 +309,11 @@ def _rgb_to_xyz(primaries: tuple[float, ...]) -> npt.NDArray[np.float64]:
 def _to_rec709(
     pixels: npt.NDArray[np.float32], primaries: tuple[float, ...], path: Path, notices: list[str]
 ) -> None:
-    """Convert (h, w, 3 | 4) in place: M = Rec.709^-1 . Bradford^-1 . diag(white ratio) . Bradford .
-    source."""
-    # 1e-3 is a few units of the last digit that files state (.3127 against .31271).
+    """Convert `pixels` (height, width, 3 | 4) to Rec.709 in place.
+
+    The matrix is Rec.709⁻¹ · Bradford⁻¹ · diag(white ratio) · Bradford · source.
+    """
+    # 1e-3 allows for the rounding of the numbers in files (.3127 against .31271).
     if np.allclose(primaries, _REC709, rtol=0, atol=1e-3):
         return
     shown = " ".join(f"{value:g}" for value in primaries)
@@ -311,7 +324,7 @@ def _to_rec709(
             matrix = np.linalg.inv(target) @ np.linalg.inv(_BRADFORD) @ adapt @ _BRADFORD @ source
         except np.linalg.LinAlgError:
             matrix = np.full((3, 3), np.nan)
-        # Real spaces stay below 4; thousands come from primaries on one line.
+        # Real colour spaces stay below 4; values in the thousands mean that the primaries lie on one line.
         if not np.all(np.abs(matrix) < 1e3):
             raise InputError(f"{path} states primaries ({shown}) that span no colour space")
         rows = max(1, _CHUNK_BYTES // (pixels.shape[1] * 24))
@@ -321,7 +334,7 @@ def _to_rec709(
 
 
 def _upright(pixels: npt.NDArray[np.float32], orientation: int) -> npt.NDArray[np.float32]:
-    """Turn by the Exif orientation 1..8, which OpenImageIO reports and leaves alone."""
+    """Turn the image by its Exif orientation, 1 to 8, which OpenImageIO reports but does not apply."""
     if orientation in (5, 7):
         pixels = pixels.swapaxes(0, 1)
     pixels = {
@@ -335,16 +348,16 @@ def _upright(pixels: npt.NDArray[np.float32], orientation: int) -> npt.NDArray[n
     return np.ascontiguousarray(pixels)
 
 
-def _complaint(teller: Any) -> str:
-    """Take what OpenImageIO, or one of its objects, last complained of."""
+def _complaint(source: Any) -> str:
+    """Fetch and clear the last error message of OpenImageIO or of one of its objects."""
     try:
-        return str(teller.geterror())
-    except UnicodeError:  # it quotes bytes of the file
+        return str(source.geterror())
+    except UnicodeError:  # the message quotes bytes of the file
         return ""
 
 
 def _reason(complaint: str, path: Path) -> str:
-    """The first line of what a library said, fit to end a sentence."""
+    """Return the first line of a library's message in a form that ends a sentence."""
     lines = complaint.strip().splitlines() or ["it could not be decoded"]
     text = " ".join("".join(c if c.isprintable() else " " for c in lines[0]).split())
     text = text.replace(f"({path})", "").replace(f'"{path}": ', "").replace(str(path), "it")

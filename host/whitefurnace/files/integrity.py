@@ -1,5 +1,7 @@
-"""Checks files for damage that OpenImageIO accepts in silence: it does not compare the checksums of a
-deflated TIFF and does not miss the end of a PNG."""
+"""Checks image files for damage that OpenImageIO silently accepts.
+
+OpenImageIO does not verify the checksums of a deflated TIFF, and does not notice a missing end of a PNG.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,11 @@ _ZLIB_TIFF = (8, 32946)
 
 
 def check_file(path: Path, size: int, head: bytes, notices: list[str]) -> None:
-    """Check the file at `path`, of `size` bytes and beginning with `head`, by what its format offers. Raises
-    `InputError` for what is damaged beyond doubt; a header that makes no sense is left to the reader."""
+    """Verify the checksums of a PNG or TIFF file of `size` bytes that begins with `head`.
+
+    Adds sentences to `notices` about colour spaces that are not applied. Raises `InputError` for certain damage; a
+    malformed header is left for the reader to report.
+    """
     if head.startswith(b"\x89PNG\r\n\x1a\n"):
         _check_png(path, size, notices)
     elif head[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
@@ -24,7 +29,7 @@ def check_file(path: Path, size: int, head: bytes, notices: list[str]) -> None:
 
 
 def _check_png(path: Path, size: int, notices: list[str]) -> None:
-    """Every length and checksum. libpng would print what is wrong with the pixels on stderr."""
+    """Verify every length and checksum. libpng would print errors in the pixels on stderr."""
     with open(path, "rb") as file:
         start = 8
         while True:
@@ -64,7 +69,7 @@ def _check_png(path: Path, size: int, notices: list[str]) -> None:
 
 
 def _check_tiff(path: Path) -> None:
-    """Inflate every deflated strip or tile for its Adler-32, a piece at a time."""
+    """Inflate every deflated strip or tile, a piece at a time, to verify its Adler-32 checksum."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             spans = list(_tiff_streams(data))
@@ -86,7 +91,7 @@ def _check_tiff(path: Path) -> None:
 
 
 def _tiff_streams(data: mmap.mmap) -> Iterator[tuple[int, int]]:
-    """(start, length) of each strip or tile of the first image of a TIFF or BigTIFF, where it is deflated."""
+    """Yield (start, length) of each strip or tile in the first image of a TIFF or BigTIFF, if it is deflated."""
     order = "<" if data[:1] == b"I" else ">"
     big = 43 in (data[2], data[3])
     offset, count, entry, inline = ("Q", "Q", 20, 8) if big else ("I", "H", 12, 4)

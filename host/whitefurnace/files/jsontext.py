@@ -1,5 +1,7 @@
-"""JSON that others wrote, as far as it can be trusted: each value is taken with its kind and range or refused in one
-sentence."""
+"""Reads JSON from untrusted sources: the type and the range of each value are checked.
+
+A value that does not fit raises an error of one sentence.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,7 @@ from whitefurnace.files.binary import Source
 
 
 def parse_object(source: Source, text: str, what: str) -> dict[str, Any]:
-    """The JSON object in `text`. Raises `InputError`."""
+    """Parse the JSON object in `text`; `what` names it in error messages. Raises `InputError`."""
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:  # a number of too many digits is a ValueError too
@@ -26,17 +28,22 @@ def parse_object(source: Source, text: str, what: str) -> dict[str, Any]:
 
 
 class Reader:
-    """Typed access to values of an object of JSON in `source`. All raise `InputError`."""
+    """Typed access to JSON values of the file `source`.
+
+    Each method returns its value or raises `InputError`; `what` names the value in the message.
+    """
 
     def __init__(self, source: Source) -> None:
         self.source = source
 
     def object(self, value: Any, what: str) -> dict[str, Any]:
+        """Check that the value is an object."""
         if not isinstance(value, dict):
             raise self.source.wrong(f"{what} is {_kind(value)}, an object was expected")
         return value
 
     def array(self, value: Any, what: str, least: int, most: int) -> list[Any]:
+        """Check that the value is an array of `least` to `most` entries."""
         if not isinstance(value, list):
             raise self.source.wrong(f"{what} is {_kind(value)}, an array was expected")
         if not least <= len(value) <= most:
@@ -45,7 +52,7 @@ class Reader:
         return value
 
     def whole(self, value: Any, what: str, least: int, most: int) -> int:
-        """A whole number, which JSON may write as 2.0."""
+        """Check that the value is a whole number from `least` to `most`. JSON may write it as 2.0."""
         if isinstance(value, bool) or not isinstance(value, int | float) or value != value // 1:
             raise self.source.wrong(f"{what} is {_kind(value)}, a whole number was expected")
         if not least <= value <= most:
@@ -53,23 +60,26 @@ class Reader:
         return int(value)
 
     def number(self, value: Any, what: str) -> float:
+        """Check that the value is a finite number."""
         if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= 1e300:
             raise self.source.wrong(f"{what} is {_kind(value)}, a finite number was expected")
         return float(value)
 
     def text(self, value: Any, what: str) -> str:
+        """Check that the value is a text."""
         if not isinstance(value, str):
             raise self.source.wrong(f"{what} is {_kind(value)}, a text was expected")
         return value
 
     def rows(self, value: Any, what: str, count: int) -> npt.NDArray[np.float64]:
-        """(count, 3) finite numbers."""
+        """Check that the value is `count` rows of three finite numbers; return them as (count, 3)."""
         rows = self.array(value, what, count, count)
         threes = [self.array(row, f"entry {k} of {what}", 3, 3) for k, row in enumerate(rows)]
         return np.array([[self.number(number, f"a number of {what}") for number in row] for row in threes], np.float64)
 
 
 def _kind(value: Any) -> str:
+    """Return the words for a value in an error message."""
     if value is None:
         return "missing"
     if isinstance(value, bool):

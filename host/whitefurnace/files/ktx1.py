@@ -1,4 +1,4 @@
-"""KTX 1 [Khronos KTX File Format Specification, 1.1]: what Filament loads."""
+"""Reads and writes KTX 1 [Khronos KTX File Format Specification, 1.1], the container that Filament loads."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _START = len(IDENTIFIER) + _HEADER.size
 
 
 class _Codes(NamedTuple):
-    """glType, glTypeSize, glFormat, glInternalFormat, glBaseInternalFormat."""
+    """Header fields of a pixel format: glType, glTypeSize, glFormat, glInternalFormat, glBaseInternalFormat."""
 
     type: int
     type_size: int
@@ -39,35 +39,41 @@ _CODES = {
     "rgba16f": _Codes(_HALF, 2, _RGBA, 0x881A, _RGBA),
     "rgba32f": _Codes(_FLOAT, 4, _RGBA, 0x8814, _RGBA),
     "rgb9e5": _Codes(0x8C3E, 4, _RGB, 0x8C3D, _RGB),
-    # As Filament's cmgen writes it and its loader demands it, 0x8C3A thrice; GL's own type is 0x8C3B and format RGB.
+    # Filament's cmgen writes 0x8C3A three times and its loader requires it; GL's own type is 0x8C3B, its format RGB.
     "b10g11r11": _Codes(0x8C3A, 1, 0x8C3A, 0x8C3A, _RGB),
     "bc6hu": _Codes(0, 1, 0, 0x8E8F, _RGB),
     "bc6hs": _Codes(0, 1, 0, 0x8E8E, _RGB),
 }
 _BY_INTERNAL = {codes.internal: name for name, codes in _CODES.items()}
-# (glType, glFormat) that others write for an internal format, beside ours.
+# Further pairs (glType, glFormat) that other programs write for an internal format.
 _ALSO = {"b10g11r11": {(0x8C3B, _RGB)}}
 _ORIENTATION = "KTXorientation"
 
 
 def write_ktx1(path: str | os.PathLike[str], texture: Texture, *, into: Transaction | None = None) -> None:
-    """Write `texture`; the same texture gives the same bytes. Raises `UnsupportedError` for a format that KTX 1 is not
-    written in, `FileError` for what cannot be written."""
+    """Write `texture` as KTX 1; the same texture gives the same bytes.
+
+    Raises `UnsupportedError` for a pixel format that is not written to KTX 1, and `FileError` where the file cannot be
+    written.
+    """
     write_pieces(path, _pieces(texture), into)
 
 
 def ktx1_bytes(texture: Texture) -> bytes:
-    """The file as bytes. Raises `UnsupportedError`."""
+    """Return the bytes of the KTX 1 file of `texture`. Raises `UnsupportedError`."""
     return b"".join(_pieces(texture))
 
 
 def read_ktx1(path: str | os.PathLike[str]) -> Texture:
-    """Read a 2-D or cube texture, or an array of them. Raises `FileError`, and `InputError` for what is not valid."""
+    """Read a KTX 1 file with a 2-D texture, a cube, or an array of either.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid.
+    """
     return parse_ktx1(load(path))
 
 
 def parse_ktx1(source: Source) -> Texture:
-    """The texture in the bytes of a file. Raises `InputError` for what is not valid."""
+    """Parse the bytes of a KTX 1 file. Raises `InputError` where they are not valid."""
     if source.piece(0, 12, "the KTX 1 identifier") != IDENTIFIER:
         raise source.wrong("it does not begin with the identifier of KTX 1")
     (endianness, kind, _, form, internal, _, width, height, depth, layers, faces, levels, key_bytes) = source.integers(
@@ -87,7 +93,7 @@ def parse_ktx1(source: Source) -> Texture:
         )
     if depth > 1:
         raise source.wrong(f"its pixelDepth is {depth}, 3-D textures are not read")
-    levels = max(levels, 1)  # 0 asks the loader for mip levels
+    levels = max(levels, 1)  # 0 asks the loader to generate mip levels
     sizes = check_header(source, name, width, height, layers, faces, levels)
     if key_bytes % 4:
         raise source.wrong(f"its bytesOfKeyValueData is {key_bytes}, a multiple of 4 is allowed")
@@ -114,13 +120,15 @@ def parse_ktx1(source: Source) -> Texture:
 
 
 def _lone_cube(layers: int, faces: int) -> bool:
-    """Whether imageSize is one face's, as for a cube that is not an array."""
+    """Return whether imageSize is the size of one face, which holds for a cube that is not an array."""
     return faces == 6 and layers == 0
 
 
 def _rows(form: str, width: int, height: int, k: int, layers: int, faces: int) -> tuple[int, int, int]:
-    """Bytes of a row of level k, the same padded to 4 (GL_UNPACK_ALIGNMENT), and the number of rows in the level. Rows
-    that fill 4 bytes leave nothing for cubePadding and mipPadding."""
+    """Return the bytes of a row of level k, the same padded to 4 (GL_UNPACK_ALIGNMENT), and the rows of the level.
+
+    With padded rows, cubePadding and mipPadding are always empty.
+    """
     kind = FORMATS[form]
     columns, rows = (-(-max(side >> k, 1) // kind.block) for side in (width, height))
     row = columns * kind.size
@@ -128,7 +136,7 @@ def _rows(form: str, width: int, height: int, k: int, layers: int, faces: int) -
 
 
 def _orientation(source: Source, value: bytes) -> str:
-    """`S=r,T=d` as "rd"."""
+    """Parse an orientation such as `S=r,T=d` to "rd". Raises `InputError`."""
     parts = value.rstrip(b"\0").split(b",")
     short = b"".join(part[2:] for part in parts)
     if [part[:2] for part in parts] not in ([b"S=", b"T="], [b"S=", b"T=", b"R="]) or short[:2] not in (

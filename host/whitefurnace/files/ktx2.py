@@ -1,5 +1,7 @@
-"""KTX 2 [Khronos KTX File Format Specification, 2.0] with its data format descriptors [Khronos Data Format
-Specification, 1.3], plain or supercompressed by Zstandard."""
+"""Reads and writes KTX 2 [Khronos KTX File Format Specification, 2.0], plain or supercompressed by Zstandard.
+
+Its data format descriptors follow [Khronos Data Format Specification, 1.3] (KDF).
+"""
 
 from __future__ import annotations
 
@@ -28,14 +30,16 @@ _ORIENTATION = "KTXorientation"
 _RGBSDA, _BC6H, _ASTC, _UASTC_HDR = 1, 133, 162, 167
 _ALPHA = 15
 _FLOAT, _SIGNED, _EXPONENT = 0x80, 0x40, 0x20
-_ONE, _MINUS_ONE = 0x3F800000, 0xBF800000  # of a float32: the range that is displayed
+_ONE, _MINUS_ONE = 0x3F800000, 0xBF800000  # bits of float32 1 and −1, the range of values that is displayed
 _BT709, _LINEAR = 1, 1
 
 
 @dataclass(frozen=True)
 class _Kind:
-    """How KTX 2 says a format: VkFormat, typeSize, and the descriptor's colour model and samples, each bit offset,
-    bits, channel with qualifiers, lower, upper."""
+    """Fields of a pixel format in KTX 2: VkFormat, typeSize, and the descriptor's colour model and samples.
+
+    A sample is (bit offset, bits, channel with qualifiers, lower, upper).
+    """
 
     vk: int
     type_size: int
@@ -57,7 +61,7 @@ _KINDS = {
     "b10g11r11": _Kind(122, 4, _RGBSDA, (
         (0, 11, 0 | _FLOAT, 0, _ONE), (11, 11, 1 | _FLOAT, 0, _ONE), (22, 10, 2 | _FLOAT, 0, _ONE),
     )),
-    # with the ranges that Khronos' own dfdutils write for this format
+    # The ranges of the samples are those that Khronos' dfdutils write for this format.
     "rgb9e5": _Kind(123, 4, _RGBSDA, tuple(
         sample for c in range(3) for sample in ((9 * c, 9, c, 0, 8448), (27, 5, c | _EXPONENT, 15, 31))
     )),
@@ -70,25 +74,30 @@ _BY_VK = {kind.vk: name for name, kind in _KINDS.items()}
 
 def write_ktx2(path: str | os.PathLike[str], texture: Texture, *, zstd: int | None = None,
                into: Transaction | None = None) -> None:
-    """Write `texture`, its levels packed by Zstandard at level `zstd` (1 to 22) where given; the same texture gives the
-    same bytes. The key KTXwriter is `whitefurnace` where `key_values` have none. Raises `UnsupportedError` for a format
-    that KTX 2 is not written in, `FileError` for what cannot be written."""
+    """Write `texture` as KTX 2; the same texture gives the same bytes.
+
+    zstd: level of Zstandard compression, 1 to 22; None for none. The key KTXwriter is `whitefurnace` unless
+    `key_values` have another. Raises `UnsupportedError` for a pixel format that is not written to KTX 2, and
+    `FileError` where the file cannot be written.
+    """
     write_pieces(path, _pieces(texture, zstd), into)
 
 
 def ktx2_bytes(texture: Texture, *, zstd: int | None = None) -> bytes:
-    """The file as bytes. Raises `UnsupportedError`."""
+    """Return the bytes of the KTX 2 file of `texture`. Raises `UnsupportedError`."""
     return b"".join(_pieces(texture, zstd))
 
 
 def read_ktx2(path: str | os.PathLike[str]) -> Texture:
-    """Read a 2-D or cube texture, or an array of them, plain or packed by Zstandard. Raises `FileError`, and
-    `InputError` for what is not valid."""
+    """Read a KTX 2 file with a 2-D texture, a cube, or an array of either, plain or packed by Zstandard.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid.
+    """
     return parse_ktx2(load(path))
 
 
 def parse_ktx2(source: Source) -> Texture:
-    """The texture in the bytes of a file. Raises `InputError` for what is not valid."""
+    """Parse the bytes of a KTX 2 file. Raises `InputError` where they are not valid."""
     if source.piece(0, 12, "the KTX 2 identifier") != IDENTIFIER:
         raise source.wrong("it does not begin with the identifier of KTX 2")
     (vk, type_size, width, height, depth, layers, faces, levels, scheme,
@@ -106,7 +115,7 @@ def parse_ktx2(source: Source) -> Texture:
         raise source.wrong(f"its pixelDepth is {depth}, 3-D textures are not read")
     if sgd_bytes:
         raise source.wrong(f"it has {sgd_bytes} bytes of supercompression global data, its scheme has none")
-    levels = max(levels, 1)  # 0 asks the loader for mip levels
+    levels = max(levels, 1)  # 0 asks the loader to generate mip levels
     sizes = check_header(source, name, width, height, layers, faces, levels)
     _check_descriptor(source, name, dfd_at, dfd_bytes)
     pairs = parse_key_values(source, kvd_at, kvd_bytes) if kvd_bytes else {}
@@ -135,8 +144,11 @@ def parse_ktx2(source: Source) -> Texture:
 
 
 def _check_descriptor(source: Source, name: str, offset: int, length: int) -> None:
-    """Whether the data format descriptor says what the VkFormat says. Only what decides how texels are read: samples'
-    ranges and primaries differ between writers."""
+    """Check the data format descriptor against the VkFormat. Raises `InputError` where they differ.
+
+    Only the fields that decide how texels are read are compared: ranges of samples and primaries differ between
+    writers.
+    """
     kind, form = _KINDS[name], FORMATS[name]
     source.piece(offset, length, "the data format descriptor")
     if length < 28:
@@ -155,7 +167,7 @@ def _check_descriptor(source: Source, name: str, offset: int, length: int) -> No
             f"vkFormat {kind.vk} (colour model {kind.model}, {len(kind.samples)} samples)"
         )
     plane &= 255
-    if plane not in (0, form.size):  # 0: documents before revision 5 wanted it where there is supercompression
+    if plane not in (0, form.size):  # specifications before revision 5 required 0 with supercompression
         raise source.wrong(f"its data format descriptor has {plane} bytes a texel or block, {name} has {form.size}")
 
 
@@ -206,9 +218,11 @@ def _file(texture: Texture, zstd: int | None) -> Iterator[Buffer]:
 
 
 def data_format_descriptor(name: str) -> bytes:
-    """dfdTotalSize and one basic descriptor block [KDF 1.3, 4 and 5]: linear, BT.709 primaries, straight alpha. With
-    supercompression too it keeps its bytes a texel [KTX 2.0 from document revision 5 on, DFD for Supercompressed
-    Data]."""
+    """Return dfdTotalSize and one basic descriptor block [KDF 1.3, 4 and 5]: linear, BT.709 primaries, straight alpha.
+
+    It states the bytes of a texel with supercompression too [KTX 2.0 from document revision 5 on, DFD for
+    Supercompressed Data].
+    """
     kind, form = _KINDS[name], FORMATS[name]
     size = 24 + 16 * len(kind.samples)
     side = form.block - 1

@@ -1,5 +1,7 @@
-"""What GPU containers hold as light: the texture or the cube in a KTX 1, KTX 2, DDS, Babylon .env or glTF file, with
-rows from the top, and what their headers say of it."""
+"""Reads the texture or cube in a KTX 1, KTX 2, DDS, Babylon .env or glTF file as light, with the facts of its header.
+
+Rows are returned from the top.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +35,18 @@ Texels = npt.NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Light:
-    """`levels` are decoded, float32 ([layers,] [6,] height, width, channels), GL-direct where they are cubes; `stored`
-    the bytes of each in the file, where it tells them. `facts` are what is to be told of the header, `keys` the texts
-    among its key-values (others by their number of bytes); `undecoded` why there are no levels, where what decodes them
-    is not installed; `roughness` that of each level where the container fixes it.
-    `polynomials` (9, 3) and `irradiance` (6, n, n, 3) are Babylon's, `irradiance_sh` (9, 3) glTF's, without a scale."""
+    """The light in a file of a GPU container.
+
+    container      title of the container; `format` the pixel format in words
+    cube, layers   whether the texture is a cube; its number of layers, 0 where it is not an array
+    levels         decoded levels, float32 ([layers,] [6,] height, width, channels); cubes are GL-direct
+    stored         bytes of each level in the file; empty where the container does not state them
+    largest        the largest finite value that each channel can hold
+    facts, keys    facts of the header for display; key-values as texts, binary ones by their number of bytes
+    undecoded      the reason where there are no levels because the package that decodes them is not installed
+    roughness      perceptual roughness of each level, where the container fixes it
+    polynomials, irradiance, irradiance_sh   Babylon's (9, 3) and (6, n, n, 3), and glTF's (9, 3) without a scale
+    """
 
     container: str
     format: str
@@ -56,8 +65,10 @@ class Light:
 
 
 def is_light(path: str | os.PathLike[str]) -> bool:
-    """Whether a file begins, or for the JSON of glTF is named, as one of these containers; false where it cannot be
-    read."""
+    """Return whether a file is one of these containers by its first bytes, or glTF by its suffix.
+
+    Returns False for a file that cannot be read.
+    """
     return is_texture(path) or _kind(path) is not None
 
 
@@ -75,8 +86,10 @@ def _kind(path: str | os.PathLike[str]) -> str | None:
 
 
 def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
-    """What such a file holds; of a texture level 0 alone where `first`. Raises `FileError`, and `InputError` for what
-    is not valid."""
+    """Read the light in a file; where `first` is True, only level 0 of a texture is decoded.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid.
+    """
     kind = _kind(path)
     if kind == "env":
         return _env(load(path))
@@ -103,7 +116,7 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
         stored = tuple(struct.unpack_from("<Q", data, 80 + 24 * k + 8)[0] for k in range(len(texture.levels)))
     elif bytes(data[:12]) == ktx1.IDENTIFIER:
         container = "KTX 1"
-        # Filament's loader takes 0x8C3A as type and format too, where GL has 0x8C3B and RGB.
+        # Filament's loader accepts 0x8C3A as type and format too, where GL has 0x8C3B and RGB.
         facts["glType"], _, facts["glFormat"], facts["glInternalFormat"] = (
             f"{code:#06x}" for code in struct.unpack_from("<4I", data, 16))
     if texture.orientation != "rd":
@@ -115,8 +128,11 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
 
 
 def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool]:
-    """Level 0 as radiance and whether it is a cube: (6, n, n, 3 | 4), or an image (h, w, 3 | 4). Raises as
-    `read_light`, `InputError` for arrays and for two channels, `UnsupportedError` for what cannot be decoded here."""
+    """Read level 0 as radiance: (6, n, n, 3 | 4) and True for a cube, (h, w, 3 | 4) and False for an image.
+
+    Raises the errors of `read_light`, `InputError` for arrays and for other numbers of channels, and
+    `UnsupportedError` where the package that decodes the format is not installed.
+    """
     light = read_light(path, first=True)
     if light.layers:
         many = "cubes" if light.cube else "images"
@@ -133,7 +149,7 @@ def _env(source: Source) -> Light:
     text = bytes(source.view[len(ENV_MAGIC):]).partition(b"\0")[0]
     lengths = [image["length"] for image in json.loads(text.decode("latin-1"))["specular"]["mipmaps"]]
     count = len(found.levels)
-    # lod = scale · log2(size · α), of which level 0 is read for all that is smoother.
+    # lod = scale · log2(size · α); roughness that gives a negative lod reads level 0.
     roughness = (0.0, *(math.sqrt(2 ** (k / found.lod_scale) / found.size) for k in range(1, count)))
     facts: dict[str, str | int] = {"width": found.size, "mips": count, "version": found.version,
                                    "images": found.image_type, "lodGenerationScale": f"{found.lod_scale:g}",
@@ -158,7 +174,7 @@ def _gltf(path: Path) -> Light:
 
 
 def light_files(path: str | os.PathLike[str]) -> list[Path]:
-    """The file, and of a .gltf the images and buffers that lie beside it too."""
+    """List the file, and for a .gltf the image and buffer files that it refers to."""
     path = Path(path)
     try:
         document = json.loads(path.read_bytes()) if path.suffix.lower() == ".gltf" else {}
@@ -169,14 +185,16 @@ def light_files(path: str | os.PathLike[str]) -> list[Path]:
 
 
 def light_digest(path: str | os.PathLike[str]) -> str:
-    """sha256 in hex of the file's bytes; of a .gltf whose images or buffers lie beside it of all of their digests.
-    Raises `FileError`."""
+    """Return the sha256 of the file's bytes in hex; for a .gltf with further files, that of all their digests joined.
+
+    Raises `FileError`.
+    """
     parts = [digest_file(file) for file in light_files(path)]
     return parts[0] if len(parts) == 1 else hashlib.sha256("".join(parts).encode()).hexdigest()
 
 
 def _largest(texture: Texture) -> tuple[float, ...]:
-    """The largest finite value that each channel can hold."""
+    """Return the largest finite value that each channel can hold."""
     if texture.format == "b10g11r11":
         return 65024.0, 65024.0, 64512.0
     kind = FORMATS[texture.format]
@@ -184,7 +202,7 @@ def _largest(texture: Texture) -> tuple[float, ...]:
 
 
 def _text(value: bytes) -> str:
-    """A key's value for people: the text it is, else how many bytes."""
+    """Return a key's value for display: its text, or its number of bytes where it is binary."""
     try:
         text = value.removesuffix(b"\0").decode()
     except UnicodeDecodeError:

@@ -1,4 +1,7 @@
-"""Arrays that are filled part by part in a memory map, for tables larger than memory, and .npy files made so."""
+"""Writes .npy files, and temporary arrays, through memory maps that are filled part by part.
+
+Tables larger than memory are written this way.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,11 @@ Fill = Callable[[npt.NDArray[Any]], object]
 
 def write_npy(path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DTypeLike, fill: Fill, *,
               into: Transaction | None = None) -> None:
-    """Write an array that `fill` fills in place; `numpy.load` gives it back. Nothing is left behind where it
-    fails. Raises `FileError` for what cannot be written, a full disk too; what `fill` raises passes through."""
+    """Write a .npy array of `shape` and `dtype` that `fill` fills in place.
+
+    A failure leaves no file behind. Raises `FileError` where the file cannot be written, for example on a full disk;
+    exceptions of `fill` pass through.
+    """
 
     def write(temporary: Path) -> None:
         array = np.lib.format.open_memmap(temporary, "w+", np.dtype(dtype), tuple(shape))
@@ -40,7 +46,7 @@ def write_npy(path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DTy
 @contextlib.contextmanager
 def scratch(path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DTypeLike,
             fill: Fill) -> Iterator[npt.NDArray[Any]]:
-    """An array that `fill` has filled, in a file without a name beside `path`. Raises `FileError`."""
+    """Give an array filled by `fill`, in a nameless temporary file in the folder of `path`. Raises `FileError`."""
     path = Path(path)
     with contextlib.ExitStack() as stack:
         try:
@@ -57,14 +63,16 @@ def scratch(path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DType
 
 
 def release(array: npt.NDArray[Any]) -> None:
-    """Lets go of the memory that the written part of a mapped array takes; the file keeps it."""
+    """Free the memory of a mapped array; its values stay in the file."""
     if isinstance(array.base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
         array.base.madvise(mmap.MADV_DONTNEED)
 
 
 def _allocate(file: BinaryIO | Any, start: int, count: int) -> None:
-    """Takes the room on disk now, for an error that can be caught: a store to a map that the disk has no room for
-    kills the process."""
+    """Reserve the disk space now, so that a full disk raises an error.
+
+    Later, a store to a map without disk space would kill the process.
+    """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), start, count)
         return
@@ -76,13 +84,13 @@ def _allocate(file: BinaryIO | Any, start: int, count: int) -> None:
 
 @contextlib.contextmanager
 def _unmapped(array: npt.NDArray[Any]) -> Iterator[None]:
-    """Closes the map at the end, whatever happens: Windows removes and renames no file that is mapped."""
+    """Close the map at the end in every case: Windows cannot remove or rename a mapped file."""
     mapped = array.base
     del array
     try:
         yield
     except BaseException as error:
-        traceback.clear_frames(error.__traceback__)  # their variables hold the array
+        traceback.clear_frames(error.__traceback__)  # variables of the frames refer to the array
         raise
     finally:
         with contextlib.suppress(BufferError):

@@ -1,5 +1,4 @@
-"""Writes arrays as .npz with the same bytes every time: numpy's own writer stamps the time into each
-member."""
+"""Writes arrays as .npz with the same bytes every time; numpy's own writer stores the time in each member."""
 
 from __future__ import annotations
 
@@ -17,8 +16,10 @@ from whitefurnace.files.atomic import Transaction, write_atomic
 
 def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, npt.ArrayLike], *,
               into: Transaction | None = None) -> None:
-    """Write `arrays` uncompressed and in their order; `numpy.load` gives them back. Nothing is left behind
-    where it fails. Raises `FileError` for what cannot be written, a full disk too."""
+    """Write `arrays` by name as .npz, uncompressed and in their order.
+
+    A failure leaves no file behind. Raises `FileError` where the file cannot be written, for example on a full disk.
+    """
 
     def write(temporary: Path) -> None:
         with open(temporary, "wb") as file, zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
@@ -27,7 +28,7 @@ def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, npt.ArrayLike],
                 member.create_system = 3  # the same on every system
                 member.external_attr = 0o600 << 16
                 array: npt.NDArray[Any] = np.asarray(values)
-                # The size is not known to zipfile in advance; 2 GiB and more need the 64-bit form.
+                # zipfile does not know the size in advance; members of 2 GiB and more need the 64-bit form.
                 with archive.open(member, "w", force_zip64=array.nbytes > 1 << 30) as stream:
                     np.lib.format.write_array(stream, array, allow_pickle=False)
 

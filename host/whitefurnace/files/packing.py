@@ -1,5 +1,7 @@
-"""Pixel formats of GPU textures as numpy, both ways: values are rounded to the nearest code, never to inf, and `step`
-says how far from a value its code may be."""
+"""Encodes and decodes the pixel formats of GPU textures with numpy.
+
+Values are rounded to the nearest code and never to inf. `step` bounds the error of the rounding.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,7 @@ import numpy.typing as npt
 from whitefurnace.errors import InputError, UnsupportedError, nearest
 
 _AT_ONCE = 1 << 18
-"""Texels that are converted at once, for a bounded need of float64 beside the data."""
+"""Number of texels converted at once, which bounds the memory of the float64 intermediates."""
 
 Floats = npt.NDArray[np.float64]
 Codes = npt.NDArray[Any]
@@ -23,9 +25,14 @@ Codes = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class Format:
-    """What a texel or block is stored as: `channels` of its colour, `size` in bytes of a texel or block, `block` its
-    texels a side (1: not compressed), `signed` where it holds negative values, and `largest`, the largest finite value
-    (for `rgb9e5` and `rgbd` of any channel)."""
+    """A pixel format.
+
+    channels  number of colour channels
+    size      bytes of a texel, or of a block
+    largest   the largest finite value (for `b10g11r11` of red and green)
+    signed    whether negative values can be stored
+    block     texels a side of a block; 1 where the format is not compressed
+    """
 
     name: str
     title: str
@@ -48,7 +55,7 @@ FORMATS: Mapping[str, Format] = {
         # GL 4.6 core, 2.3.4.3 and 2.3.4.4: (1 + 63/64)·2^15; blue, of 10 bits, ends at (1 + 31/32)·2^15 = 64512
         Format("b10g11r11", "unsigned floats of 11, 11 and 10 bits", 3, 4, 65024.0),
         Format("rgbd", "8-bit colour · D with D in alpha, of Babylon.js", 3, 4, 255.0),
-        # Blocks are not texels of their own: BC6H is coded in bc6h.py, ASTC in astc.py.
+        # Formats of blocks are encoded elsewhere: BC6H in bc6h.py, ASTC in astc.py.
         Format("bc6hu", "BC6H blocks, unsigned", 3, 16, 65504.0, block=4),
         Format("bc6hs", "BC6H blocks, signed", 3, 16, 65504.0, signed=True, block=4),
         Format("astc4x4hdr", "ASTC blocks of 4 x 4 texels, HDR", 4, 16, 65504.0, signed=True, block=4),
@@ -58,8 +65,11 @@ FORMATS: Mapping[str, Format] = {
 
 @dataclass(frozen=True)
 class Packed:
-    """`data` is uint8 (..., bytes a texel), little-endian; `clipped` counts values that were too large and became the
-    largest finite one, `negative` those below 0 that became 0 because the format has no sign."""
+    """Encoded texels.
+
+    `data` is uint8 (..., bytes of a texel), little-endian. `clipped` counts the values that were too large and became
+    the largest finite one; `negative` counts the values below 0 that became 0 because the format has no sign.
+    """
 
     data: npt.NDArray[np.uint8]
     clipped: int
@@ -67,7 +77,7 @@ class Packed:
 
 
 def format_named(name: str) -> Format:
-    """The format of that name. Raises `UnsupportedError`, with the nearest name."""
+    """Return the pixel format called `name`. Raises `UnsupportedError`, which suggests the nearest name."""
     try:
         return FORMATS[name]
     except KeyError:
@@ -75,11 +85,11 @@ def format_named(name: str) -> Format:
 
 
 def pack(name: str, values: npt.ArrayLike) -> Packed:
-    """`values` (..., channels), finite or infinite, in the format `name`, each rounded to the nearest code (a tie to
-    the even one; of rgb9e5 upwards, as its specification has it). A missing fourth channel is 1.
+    """Encode `values` (..., channels) in the format `name`, each rounded to the nearest code.
 
-    A value that would round to inf becomes the largest finite one, one below 0 becomes 0 where the format has no sign,
-    and both are counted. Raises `InputError` for NaN and `UnsupportedError` for a format of blocks.
+    Ties go to the even code; those of rgb9e5 go up, as its specification requires. A missing fourth channel is 1. A
+    value that would round to inf becomes the largest finite one; a value below 0 becomes 0 where the format has no
+    sign. Both are counted. Raises `InputError` for NaN, and `UnsupportedError` for a format of blocks.
     """
     kind = _coded(name)
     array = _floats(values)
@@ -114,8 +124,11 @@ def pack(name: str, values: npt.ArrayLike) -> Packed:
 
 def unpack(name: str, data: bytes | memoryview | npt.NDArray[np.uint8], shape: tuple[int, ...]) -> npt.NDArray[
         np.float32]:
-    """What a GPU reads from `data`: float32 (*shape, channels), exact but for rgbd (½ ulp). Inf and NaN in foreign
-    data stay what they are. Raises `UnsupportedError` for a format of blocks."""
+    """Decode `data` as a GPU does, to float32 (*shape, channels).
+
+    The result is exact, except for rgbd (½ ulp). Inf and NaN in the data are kept. Raises `UnsupportedError` for a
+    format of blocks.
+    """
     kind = _coded(name)
     raw = np.frombuffer(data, np.uint8)
     count = math.prod(shape)
@@ -129,9 +142,11 @@ def unpack(name: str, data: bytes | memoryview | npt.NDArray[np.uint8], shape: t
 
 
 def step(name: str, values: npt.ArrayLike) -> Floats:
-    """Bound of |unpack(pack(v)) - v| for each of `values` (..., channels): half the distance of the two codes around
-    it, which for rgb9e5 and rgbd depends on the texel's largest channel; for a clipped value how much it loses.
-    float64 of the shape of `values`."""
+    """Return a bound of |unpack(pack(v)) − v| for each of `values` (..., channels), float64 of the same shape.
+
+    The bound is half the distance of the two codes around the value, which for rgb9e5 and rgbd depends on the largest
+    channel of the texel; for a clipped value it is the part above the largest code.
+    """
     kind = _coded(name)
     array = np.asarray(values, np.float64)
     if not array.ndim or array.shape[-1] > kind.channels:
@@ -143,6 +158,7 @@ def step(name: str, values: npt.ArrayLike) -> Floats:
 
 
 def _coded(name: str) -> Format:
+    """Return a format that is encoded texel by texel. Raises `UnsupportedError` for a format of blocks."""
     kind = format_named(name)
     if kind.block > 1:
         raise UnsupportedError(f"{name} ({kind.title}) has blocks, which are not packed texel by texel")
@@ -150,7 +166,7 @@ def _coded(name: str) -> Format:
 
 
 def _floats(values: npt.ArrayLike) -> npt.NDArray[Any]:
-    """float32 stays, all else becomes float64: no rounding before the one that counts."""
+    """Return the values as float32 or float64, so that nothing is rounded before the encoding."""
     array = np.asarray(values)
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 
@@ -160,19 +176,19 @@ def _floats(values: npt.ArrayLike) -> npt.NDArray[Any]:
 
 def _encode_float(dtype: str, values: npt.NDArray[Any]) -> tuple[Codes, int]:
     largest, overflow = _ends(dtype)
-    # float32 given for float32: only inf is too large
+    # For float32 values in float32, only inf is too large.
     over = np.isinf(values) if overflow > float(np.finfo(values.dtype).max) else np.abs(values) >= overflow
     count = int(np.count_nonzero(over))
     if count:
         values = np.where(over, np.copysign(largest, values), values)
-    # numpy rounds float32 and float64 alike in one step, ties to even; next to the overflow it need not warn
+    # numpy rounds float32 and float64 in one step, ties to even; a warning near the overflow is not needed.
     with np.errstate(over="ignore"):
         return values.astype(dtype), count
 
 
 @cache
 def _ends(dtype: str) -> tuple[float, float]:
-    """The largest finite value and the one from which on rounding to nearest gives inf, half an ulp above."""
+    """Return the largest finite value, and the value from which rounding to nearest gives inf, half an ulp above."""
     info = np.finfo(dtype)
     largest = float(info.max)
     return largest, largest + 2.0 ** (info.maxexp - 2 - info.nmant)
@@ -183,7 +199,7 @@ def _decode_float(dtype: str, raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.floa
 
 
 def _half_ulp(values: Floats, mantissa: int, smallest_exponent: int, largest: float) -> Floats:
-    """Half an ulp of floats of `mantissa` bits at `values` >= 0; the ulp of the last binade above it."""
+    """Return half an ulp of floats with `mantissa` bits at `values` >= 0; above `largest`, that of the last binade."""
     exponent = np.frexp(np.minimum(values, largest))[1] - 1  # frexp's fraction is in [½, 1)
     exponent = np.where(values > 0, np.maximum(exponent, smallest_exponent), smallest_exponent)
     return np.ldexp(1.0, exponent - mantissa - 1)
@@ -206,13 +222,17 @@ def _small_largest(mantissa: int) -> float:
 
 
 def _encode_small(values: npt.NDArray[Any]) -> tuple[Codes, int]:
-    """x = q·2^(e-m) with e = max(⌊log2 x⌋, -14) and q an integer below 2^(m+1): then (e+14)·2^m + q is the code, the
-    leading 1 of q counting the exponent up, for denormals (e = -14, q < 2^m) as for a q rounded up to 2^(m+1)."""
+    """Encode R11G11B10F.
+
+    Write x = q·2^(e-m) with e = max(⌊log2 x⌋, -14) and an integer q below 2^(m+1). The code is (e+14)·2^m + q: the
+    leading 1 of q increments the exponent. This holds for denormals (e = -14, q < 2^m) and for a q that is rounded up
+    to 2^(m+1) too.
+    """
     word = np.zeros(len(values), np.uint32)
     clipped = 0
     for channel, (mantissa, shift) in enumerate(zip(_MANTISSAS, _SHIFTS, strict=True)):
         x = values[:, channel].astype(np.float64)
-        overflow = _small_largest(mantissa) + 2.0 ** (14 - mantissa)  # half an ulp more, a tie to even: to inf
+        overflow = _small_largest(mantissa) + 2.0 ** (14 - mantissa)  # half an ulp above; this tie rounds to inf
         over = x >= overflow
         clipped += int(np.count_nonzero(over))
         x = np.where(over, _small_largest(mantissa), x)
@@ -233,7 +253,7 @@ def _decode_small(raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
 
 @cache
 def _small_table(mantissa: int) -> npt.NDArray[np.float32]:
-    """The value of every code: float32 (2^(5+mantissa),)."""
+    """Return the value of every code, float32 (2^(5+mantissa),)."""
     code = np.arange(32 << mantissa)
     exponent, fraction = code >> mantissa, code & ((1 << mantissa) - 1)
     value = np.where(exponent > 0, np.ldexp(1 + fraction / (1 << mantissa), exponent - 15),
@@ -256,13 +276,13 @@ _SHARED_LARGEST = 65408.0
 
 
 def _round_up_at_half(x: Floats) -> Floats:
-    """⌊x + ½⌋ without the rounding of that sum."""
+    """Return ⌊x + ½⌋ without the rounding error of that sum."""
     whole = np.floor(x)
     return whole + (x - whole >= 0.5)
 
 
 def _shared_exponent(top: Floats) -> npt.NDArray[np.int64]:
-    """The biased exponent for texels whose largest channel is `top` in [0, 65408]: exp_shared of 8.5.2."""
+    """Return the biased exponent, exp_shared of 8.5.2, of texels whose largest channel is `top` in [0, 65408]."""
     log2 = np.where(top > 0, np.frexp(top)[1] - 1, -_SHARED_BIAS - 1)
     shared = np.maximum(log2, -_SHARED_BIAS - 1) + 1 + _SHARED_BIAS
     top_code = _round_up_at_half(np.ldexp(top, _SHARED_BIAS + _SHARED_BITS - shared))
@@ -271,7 +291,7 @@ def _shared_exponent(top: Floats) -> npt.NDArray[np.int64]:
 
 def _encode_shared(values: npt.NDArray[Any]) -> tuple[Codes, int]:
     x = values.astype(np.float64)
-    clipped = int(np.count_nonzero(x >= _SHARED_LARGEST + 64))  # half a step of 2^(31-15-9) more
+    clipped = int(np.count_nonzero(x >= _SHARED_LARGEST + 64))  # half a step of 2^(31-15-9) above
     x = np.minimum(x, _SHARED_LARGEST)
     shared = _shared_exponent(x.max(axis=1))
     code = _round_up_at_half(np.ldexp(x, (_SHARED_BIAS + _SHARED_BITS - shared)[:, None])).astype(np.uint32)
@@ -300,18 +320,18 @@ def _gamma_table() -> Floats:
 
 
 def _divisor(values: Floats) -> Floats:
-    """255·D = ⌊255 / the largest channel⌋ in [1, 255], (..., 1)."""
+    """Return 255·D = ⌊255 / the largest channel⌋, in [1, 255], (..., 1)."""
     top = np.maximum(values.max(axis=-1, keepdims=True), 1.0)
     return np.clip(np.floor(255.0 / top), 1.0, 255.0)
 
 
 def _code_below(scaled: Floats) -> npt.NDArray[np.int64]:
-    """The code k in [0, 254] with (k/255)^2.2 <= scaled < ((k+1)/255)^2.2."""
+    """Return the code k in [0, 254] with (k/255)^2.2 <= scaled < ((k+1)/255)^2.2."""
     return np.clip(np.searchsorted(_gamma_table(), scaled, side="right") - 1, 0, 254)
 
 
 def _encode_rgbd(values: npt.NDArray[Any]) -> tuple[Codes, int]:
-    """The nearest in what is read, not in what is stored: the power between them moves the middle."""
+    """Encode RGBD. The codes are the nearest in decoded values; the gamma curve makes these differ from code values."""
     x = values.astype(np.float64)
     divisor = _divisor(x)
     scaled = x * (divisor / 255.0)
@@ -324,7 +344,7 @@ def _encode_rgbd(values: npt.NDArray[Any]) -> tuple[Codes, int]:
 
 
 def _decode_rgbd(raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
-    with np.errstate(divide="ignore", invalid="ignore"):  # D = 0 is inf in the shader too
+    with np.errstate(divide="ignore", invalid="ignore"):  # D = 0 gives inf in the shader too
         return (_gamma_table()[raw[:, :3]] * 255.0 / raw[:, 3:]).astype(np.float32)
 
 
@@ -334,7 +354,7 @@ def _step_rgbd(values: Floats) -> tuple[Floats, Floats]:
     table = _gamma_table()
     code = _code_below(values / scale)
     half = (table[code + 1] - table[code]) / 2 * scale
-    # the float32 that is read, and the float64 of the powers on both ways
+    # The second term is the rounding of the decoded float32, and of the powers in float64.
     return half + np.spacing(np.float32(255.0)) * values / 255.0, np.broadcast_to(scale, values.shape)
 
 

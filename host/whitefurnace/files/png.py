@@ -1,5 +1,8 @@
-"""PNG images of 8 bits a channel, to and from bytes, bit for bit: the codes of RGBD among them, whose alpha must never
-be multiplied into the colour. OpenImageIO codes and decodes; lengths, checksums and sizes are checked before."""
+"""Encodes and decodes PNG images bit for bit.
+
+RGBD codes are stored in PNG, so alpha is never multiplied into the colour. OpenImageIO encodes and decodes; lengths,
+checksums and sizes are checked before.
+"""
 
 from __future__ import annotations
 
@@ -26,14 +29,17 @@ Pixels = npt.NDArray[np.uint8]
 _HEADER = struct.Struct(">2I5B")
 _RGB, _RGBA = 2, 6  # colour types [PNG 3, 11.2.1]
 _PIECE = 1 << 20
-# Deflate packs at most 258 bytes in two bits: 1032 : 1 [RFC 1951, 3.2.5]
+# Deflate packs at most 258 bytes into two bits, 1032 : 1 [RFC 1951, 3.2.5].
 _MAX_RATIO = 1032
 
 
 def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False, effort: int = 9) -> bytes:
-    """`pixels` (height, width, 1 | 3 | 4) of 8 or 16 bits as a PNG: the same pixels give the same bytes. There is
-    nothing in it but the pixels, and `srgb` says that they are a picture in sRGB: what states no colour space no reader
-    converts. `effort` of zlib, 1 to 9."""
+    """Encode `pixels` (height, width, 1 | 3 | 4) of 8 or 16 bits as PNG; the same pixels give the same bytes.
+
+    The file holds the pixels and no other data. srgb: mark the pixels as a picture in sRGB; readers do not convert an
+    image without a colour space. effort: compression level of zlib, 1 to 9. Raises `FileError` where OpenImageIO
+    fails.
+    """
     pixels = np.ascontiguousarray(pixels)
     if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or \
             0 in pixels.shape:
@@ -53,8 +59,8 @@ def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False, effort: int = 9)
             complaint = (output.geterror() if output is not None else "") or oiio.geterror() or "no reason given"
             raise FileError(f"OpenImageIO cannot write a PNG: {complaint.strip().splitlines()[0]}")
         made = Source(path.read_bytes(), "a PNG of OpenImageIO")
-    # What else it writes, a gamma, chromaticities, Exif and an offset, may lead a browser to convert the codes, and
-    # takes more than the texels of a small face.
+    # OpenImageIO also writes a gamma, chromaticities, Exif and an offset. They may lead a browser to convert the codes,
+    # and take more bytes than the texels of a small face.
     kept = {kind: b"" for kind in (b"IHDR", b"IDAT", b"IEND")}
     for kind, body in _chunks(made):
         if kind in kept:
@@ -66,8 +72,11 @@ def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False, effort: int = 9)
 
 
 def decode_png(data: Buffer | Source, *, side: int | None = None) -> Pixels:
-    """The pixels of an 8-bit RGB or RGBA PNG as they are stored, uint8 (height, width, 3 | 4), of side x side where
-    `side` is given. Raises `InputError` for what is damaged, of another size, or of another kind of PNG."""
+    """Decode the stored pixels of an 8-bit RGB or RGBA PNG, uint8 (height, width, 3 | 4).
+
+    side: the expected width and height; None for any. Raises `InputError` for a PNG that is damaged, of another size
+    or of another kind.
+    """
     source = data if isinstance(data, Source) else Source(data, "a PNG")
     width, height, channels, packed = _checked(source, side)
     head = _chunk(b"IHDR", _HEADER.pack(width, height, 8, _RGBA if channels == 4 else _RGB, 0, 0, 0))
@@ -79,9 +88,11 @@ def decode_png(data: Buffer | Source, *, side: int | None = None) -> Pixels:
 
 def write_png(path: str | os.PathLike[str], image: npt.ArrayLike, *, effort: int = 9,
               into: Transaction | None = None) -> None:
-    """Write a picture (height, width, 3 | 4) in sRGB: uint8, or floats of 0 to 1 that are in sRGB already and are
-    rounded to the nearest of 255 steps, what is beyond to the ends. Raises `InputError` for NaN, `FileError` for what
-    cannot be written."""
+    """Write a picture (height, width, 3 | 4) in sRGB as PNG.
+
+    image: uint8, or sRGB floats from 0 to 1, which are clamped and rounded to the nearest of 255 steps. effort:
+    compression level of zlib, 1 to 9. Raises `InputError` for NaN, and `FileError` where the file cannot be written.
+    """
     array = np.asarray(image)
     if array.dtype != np.uint8:
         values = array.astype(np.float64)
@@ -92,8 +103,10 @@ def write_png(path: str | os.PathLike[str], image: npt.ArrayLike, *, effort: int
 
 
 def decode_by_oiio(data: bytes, form: str, source: Source) -> Pixels:
-    """The pixels of an image file as they are stored, uint8 (height, width, channels). Only for data whose size was
-    checked. Raises `InputError` that names `source`."""
+    """Decode an image file to its stored pixels, uint8 (height, width, channels).
+
+    The caller must have checked the size that the header states. Raises `InputError`, which names `source`.
+    """
     import OpenImageIO as oiio
 
     hints = oiio.ImageSpec()
@@ -108,7 +121,7 @@ def decode_by_oiio(data: bytes, form: str, source: Source) -> Pixels:
             failed = reader.has_error
             complaint = _complaint(reader) or complaint
             reader.close()
-            pixels = None if failed else pixels  # JPEG fills what is missing and only complains
+            pixels = None if failed else pixels  # missing parts of a JPEG are filled and only set an error message
     if pixels is None:
         reason = " ".join((complaint.replace(str(path), "it") or "no reason given").split())[:120]
         raise source.wrong(f"OpenImageIO cannot decode it as {form} ({reason})")
@@ -117,7 +130,10 @@ def decode_by_oiio(data: bytes, form: str, source: Source) -> Pixels:
 
 @contextlib.contextmanager
 def _scratch_file(suffix: str) -> Iterator[Path]:
-    """A file for OpenImageIO, whose Python binding opens nothing else; closed by us meanwhile, as Windows wants it."""
+    """Give the path of a temporary file: OpenImageIO's Python binding reads and writes files alone.
+
+    The file is closed while OpenImageIO uses it, as Windows requires.
+    """
     try:
         handle, name = tempfile.mkstemp(suffix=suffix)
         os.close(handle)
@@ -133,7 +149,7 @@ def _scratch_file(suffix: str) -> Iterator[Path]:
 
 
 def _checked(source: Source, side: int | None) -> tuple[int, int, int, bytes]:
-    """Width, height, channels and the deflated rows of a PNG in which everything is right but, maybe, the values."""
+    """Check everything in a PNG except the pixel values; return width, height, channels and the deflated rows."""
     if source.piece(0, 8, "the signature of a PNG") != SIGNATURE:
         raise source.wrong("it does not begin with the signature of a PNG")
     size: tuple[int, int, int] | None = None
@@ -176,7 +192,7 @@ def _size(source: Source, body: memoryview, side: int | None) -> tuple[int, int,
 
 
 def _inflated(source: Source, data: bytes, wanted: int) -> bytearray:
-    """Exactly `wanted` bytes; memory grows with what comes out."""
+    """Inflate `data` to exactly `wanted` bytes, piece by piece, so that memory grows only with the output."""
     inflate, out, left = zlib.decompressobj(), bytearray(), data
     try:
         while not inflate.eof and len(out) <= wanted:
@@ -194,7 +210,7 @@ def _inflated(source: Source, data: bytes, wanted: int) -> bytearray:
 
 
 def _chunks(source: Source) -> Iterator[tuple[bytes, memoryview]]:
-    """Kind and body of each chunk to the end marker, their checksums compared."""
+    """Yield the kind and the body of each chunk up to the end marker, and verify the checksums."""
     at = len(SIGNATURE)
     while True:
         length, kind = struct.unpack(">I4s", source.piece(at, 8, f"the PNG chunk at byte {at}"))
@@ -212,8 +228,9 @@ def _chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(body, zlib.crc32(kind)))
 
 
-def _complaint(teller: Any) -> str:
+def _complaint(source: Any) -> str:
+    """Fetch and clear the last error message of OpenImageIO or of one of its objects."""
     try:
-        return str(teller.geterror())
-    except UnicodeError:  # it quotes bytes of the file
+        return str(source.geterror())
+    except UnicodeError:  # the message quotes bytes of the file
         return ""

@@ -1,4 +1,4 @@
-"""Cube faces as Babylon.js stores them in `.env` files and in glTF: RGBD codes in PNG, the rows from the bottom up."""
+"""Encodes and decodes cube faces as Babylon.js stores them in `.env` and glTF: RGBD in PNG, rows from the bottom up."""
 
 from __future__ import annotations
 
@@ -13,11 +13,14 @@ from whitefurnace.files.png import SIGNATURE, decode_by_oiio, decode_png, encode
 
 Level = npt.NDArray[np.float32]
 MAX_SIZE = 8192
-"""Of a face: what all mips of a cube hold as floats stays below the 8 GiB that a texture may have."""
+"""Largest side of a face: all mips of such a cube, as floats, stay below the 8 GiB that a texture may have."""
 
 
 def check_chain(levels: tuple[Level, ...], whole: bool) -> str:
-    """What is wrong with the levels of a cube, to end a sentence; empty where nothing is. `whole` chains end at 1."""
+    """Return the error in the levels of a cube as the end of a sentence; an empty text where there is none.
+
+    whole: whether the chain must go down to one texel.
+    """
     if not levels:
         return "there is no level"
     size = levels[0].shape[1] if levels[0].ndim == 4 else 0
@@ -32,15 +35,21 @@ def check_chain(levels: tuple[Level, ...], whole: bool) -> str:
 
 
 def encode_faces(level: npt.ArrayLike) -> tuple[list[bytes], int, int]:
-    """The six PNG of a level (6, n, n, 3), how many values were clipped to 255 and how many negative ones became 0.
-    Raises `InputError` for NaN."""
+    """Encode a level (6, n, n, 3) as six PNG.
+
+    Returns the PNG, the number of values clipped to 255, and the number of negative values set to 0. Raises
+    `InputError` for NaN.
+    """
     packed = pack("rgbd", level)
     return [encode_png(face[::-1]) for face in packed.data], packed.clipped, packed.negative
 
 
 def decode_face(source: Source, side: int) -> Level:
-    """A face (side, side, 3) as the engine reads it: RGBD from what has alpha, else (a PNG without, JPEG) colours of
-    gamma 2.2 up to 1. Raises `InputError`."""
+    """Decode a face to (side, side, 3) as the engine does.
+
+    An image with alpha holds RGBD. An image without (some PNG, all JPEG) holds colours up to 1 with a gamma of 2.2.
+    Raises `InputError`.
+    """
     head = bytes(source.view[:12])
     if head.startswith(SIGNATURE):
         codes = decode_png(source, side=side)
@@ -56,7 +65,10 @@ def decode_face(source: Source, side: int) -> Level:
 
 
 def _other(form: str, source: Source, size: tuple[int, int], side: int) -> npt.NDArray[np.uint8]:
-    """What OpenImageIO decodes by itself; it allocates what the header says, which is therefore known before."""
+    """Decode a WebP or JPEG whose header states `size`.
+
+    OpenImageIO allocates what the header states, so the size is compared with `side` before.
+    """
     if size != (side, side):
         raise source.wrong(f"it has {size[0]} x {size[1]} pixels, {side} x {side} were expected")
     codes = decode_by_oiio(bytes(source.view), form, source)
@@ -66,7 +78,7 @@ def _other(form: str, source: Source, size: tuple[int, int], side: int) -> npt.N
 
 
 def _webp_size(source: Source) -> tuple[int, int]:
-    """Width and height of the first chunk of a WebP [RFC 9649, 2.5 to 2.7]."""
+    """Return the width and height in the first chunk of a WebP [RFC 9649, 2.5 to 2.7]."""
     kind = bytes(source.piece(12, 4, "the first chunk of a WebP"))
     body = bytes(source.piece(20, 10, "the header of a WebP"))
     if kind == b"VP8X":
@@ -81,7 +93,7 @@ def _webp_size(source: Source) -> tuple[int, int]:
 
 
 def _jpeg_size(source: Source) -> tuple[int, int]:
-    """Width and height in the frame header of a JPEG [ITU T.81, B.2.2]."""
+    """Return the width and height in the frame header of a JPEG [ITU T.81, B.2.2]."""
     at = 2
     while True:
         mark, kind = source.piece(at, 2, f"the JPEG marker at byte {at}")

@@ -1,4 +1,4 @@
-"""An image as its file has it: facts of the header, and values without the decoding that makes radiance of them."""
+"""Reads images as stored: the facts of the header, and the values without decoding them to radiance."""
 
 from __future__ import annotations
 
@@ -24,8 +24,13 @@ PREFIX = "whitefurnace:"
 
 @dataclass(frozen=True)
 class ImageFacts:
-    """What the header of an image says: `format` OpenImageIO's name, `pixel` the type of a value ("half", "uint8"),
-    `compression` where there is one, `attributes` our own, without their prefix."""
+    """Facts in the header of an image.
+
+    format       OpenImageIO's name of the file format
+    pixel        type of a value, such as "half" or "uint8"
+    compression  its name, empty where there is none
+    attributes   the attributes that this package wrote, without their prefix
+    """
 
     format: str
     width: int
@@ -37,21 +42,27 @@ class ImageFacts:
 
 
 def image_facts(path: str | os.PathLike[str]) -> ImageFacts:
-    """The facts of an image file. Raises `FileError`, and `InputError` for what is no valid image."""
+    """Read the facts in the header of an image.
+
+    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not a valid image.
+    """
     with _opened(Path(path)) as (_, facts):
         return facts
 
 
 def read_stored(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
-    """All channels as stored, float32 (height, width, channels): integers over their largest code, no transfer function
-    and no primaries. Raises as `image_facts`."""
+    """Read all channels as stored, float32 (height, width, channels).
+
+    Integers are divided by their largest code. No transfer function and no primaries are applied. Raises the errors of
+    `image_facts`.
+    """
     path = Path(path)
     with _opened(path) as (source, facts):
         return image._read_pixels(source, source.spec(), list(range(len(facts.channels))), path, "float")
 
 
 def read_rgbd(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
-    """What Babylon.js reads of a PNG of RGBD: float32 (height, width, 3). Raises as `image_facts`."""
+    """Decode a PNG of RGBD as Babylon.js does, to float32 (height, width, 3). Raises the errors of `image_facts`."""
     source = load(path)
     pixels = decode_png(source)
     if pixels.shape[2] != 4:

@@ -1,4 +1,4 @@
-"""Tables as textures and as C: PNG of 16 or 8 bits, KTX 2, DDS, an array in a header, each with what storing costs."""
+"""Writes tables as PNG of 16 or 8 bits, KTX 2, DDS or a C header, and returns the error of the stored format."""
 
 from __future__ import annotations
 
@@ -26,26 +26,29 @@ STORED: Mapping[str, Sequence[str]] = {
     ".dds": ("rg16f", "rgba16f", "rgba32f"),
     ".h": (),
 }
-"""The formats of values by suffix; the first that has the channels is the usual one. A header has them as they are."""
+"""Pixel formats by suffix; the first with enough channels is the default. A C header holds the values unchanged."""
 
 ZSTD = 19
-"""The level of Zstandard: tables are small, and are written once."""
+"""Compression level of Zstandard: high, because tables are small and are written once."""
 
 MOST = 1 << 22
-"""Values that a header holds at most: compilers take minutes over more."""
+"""Largest number of values in a C header: compilers take minutes for more."""
 
 
 @dataclass(frozen=True)
 class Stored:
-    """What a file holds: the format of its values, and by how much they are off those given at most."""
+    """The format of the values in a file, and the largest absolute error of storing them."""
 
     format: str
     error: float
 
 
 def stored_format(suffix: str, channels: int, given: str | None) -> str | None:
-    """The format that a table of `channels` is stored in; None where its file holds the values as they are. Raises
-    UsageError for one that the file has not, UnsupportedError for more channels than it holds."""
+    """Return the format for a table of `channels` in a file with `suffix`; None where the values are stored unchanged.
+
+    given: the format that the user chose, or None for the default. Raises `UsageError` for a format that the file
+    does not have, and `UnsupportedError` for more channels than the format holds.
+    """
     known = STORED.get(suffix, ())
     if given is not None and given not in known:
         named = f"; {suffix} holds {', '.join(known)}" if known else f"; {suffix} holds the values as they are"
@@ -61,7 +64,7 @@ def stored_format(suffix: str, channels: int, given: str | None) -> str | None:
 
 
 def check_table(suffix: str, shape: Sequence[int], channels: int) -> None:
-    """Whether a table of `shape` […, y, x] fits in a file with that suffix. Raises UsageError."""
+    """Check that a table of `shape` […, y, x] fits in a file with that suffix. Raises `UsageError` otherwise."""
     if suffix == ".h":
         if math.prod(shape) * channels > MOST:
             raise UsageError(f"a header holds {MOST} values at most, not {math.prod(shape) * channels}: give .npy")
@@ -76,11 +79,12 @@ def check_table(suffix: str, shape: Sequence[int], channels: int) -> None:
 def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str | None, *, slack: float = 0.0,
                 texts: Mapping[str, str] | None = None, comment: Sequence[str] = (),
                 into: Transaction | None = None) -> Stored:
-    """Write `cells` […, y, x, c], floats, as .png, .ktx2, .dds or .h by the suffix of `path`, in the format `form`.
+    """Write the floats `cells` […, y, x, c] as .png, .ktx2, .dds or .h, by the suffix of `path`.
 
-    A third axis is the layers of a 2-D array. A channel that the format has more is 0, the fourth 1. PNG holds values
-    from 0 to 1; what lies beyond by `slack` is clamped. `texts` are key-values of KTX 2, `comment` heads a header.
-    Raises `UnsupportedError` for values that do not fit, `FileError` for what cannot be written.
+    A third axis becomes the layers of a 2-D array. Channels that the table does not have are 0, the fourth is 1.
+    form: a format of STORED; None for .h. slack: how far values may lie outside 0 to 1 in a PNG; they are clamped.
+    texts: key-values of KTX 2. comment: first lines of a C header.
+    Raises `UnsupportedError` for values that do not fit, and `FileError` where the file cannot be written.
     """
     path, suffix = Path(path), Path(path).suffix.lower()
     low, high = float(cells.min()), float(cells.max())
@@ -89,7 +93,7 @@ def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str
                                ".npy or .exr")
     if suffix == ".h":
         write_pieces(path, (line.encode() for line in _header(path.stem, cells, comment)), into)
-        return Stored(cells.dtype.name, 0.0)  # as many digits as tell every value from its neighbours
+        return Stored(cells.dtype.name, 0.0)  # enough digits to read back the same floats
     assert form is not None
     if suffix == ".png":
         most = 65535 if form == "r16" else 255
@@ -99,7 +103,7 @@ def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str
                                    "PNG holds: give .exr, .npy or .ktx2")
         held = np.rint(np.clip(cells.astype(np.float64), 0, 1) * most)
         codes = held.astype(np.uint16 if most > 255 else np.uint8)
-        # Grey with alpha is no pair to any loader of textures: two channels are red and green.
+        # No texture loader reads grey with alpha as two values, so two channels are stored as red and green.
         write_pieces(path, [encode_png(_widened(codes, 3 if codes.shape[-1] == 2 else codes.shape[-1], most))], into)
         return Stored(form, float(np.abs(held / most - cells).max()))
     largest = FORMATS[form].largest
@@ -114,7 +118,7 @@ def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str
 
 
 def _widened(cells: npt.NDArray[Any], channels: int, one: int) -> npt.NDArray[Any]:
-    """`cells` with as many channels: those that are added are 0, a fourth `one`."""
+    """Extend `cells` to `channels`: new channels are 0, a new fourth one is `one`."""
     missing = channels - cells.shape[-1]
     if not missing:
         return cells
@@ -127,23 +131,24 @@ def _widened(cells: npt.NDArray[Any], channels: int, one: int) -> npt.NDArray[An
 KEYWORDS = frozenset("auto break case char const continue default do double else enum extern float for goto if inline "
                      "int long register restrict return short signed sizeof static struct switch typedef union "
                      "unsigned void volatile while".split())
-"""Of C: a file may be called default.h."""
+"""Keywords of C, which cannot name an array: a file may be called default.h."""
 
 
 def identifier(stem: str) -> str:
-    """A name of C from that of a file."""
+    """Return a C identifier made from the stem of a file's name."""
     name = "".join(c if c.isascii() and c.isalnum() else "_" for c in stem)
     return name if name[:1].isalpha() and name not in KEYWORDS else f"table_{name}"
 
 
 def number(value: float, kind: str) -> str:
-    """A literal of C and GLSL that reads back as the same float."""
+    """Return a C and GLSL literal that reads back as the same float; `kind` is "float32" or "float64"."""
     text = f"{value:.9g}" if kind == "float32" else f"{value:.17g}"
     text = text if set(text) & set(".e") else f"{text}.0"
     return f"{text}f" if kind == "float32" else text
 
 
 def _header(stem: str, cells: npt.NDArray[Any], comment: Sequence[str]) -> Iterator[str]:
+    """Yield the text of a C header with the array `cells`."""
     name, kind = identifier(stem), cells.dtype.name
     yield "".join(f"// {line}\n" for line in comment)
     yield f"#ifndef {name.upper()}_H\n#define {name.upper()}_H\n\n"
@@ -152,7 +157,7 @@ def _header(stem: str, cells: npt.NDArray[Any], comment: Sequence[str]) -> Itera
     rows = cells.reshape(-1, *cells.shape[-2:])
     outer = shape[:cells.ndim - 3]
     for k, row in enumerate(rows):
-        # Braces of the outer axes open and close where their count goes round.
+        # The braces of an outer axis open at its first row and close at its last.
         opened = sum(1 for d in range(len(outer)) if k % math.prod([*outer[d + 1:], cells.shape[-3]]) == 0)
         closed = sum(1 for d in range(len(outer)) if (k + 1) % math.prod([*outer[d + 1:], cells.shape[-3]]) == 0)
         texels = [", ".join(number(x, kind) for x in texel) for texel in row.tolist()]
@@ -162,5 +167,5 @@ def _header(stem: str, cells: npt.NDArray[Any], comment: Sequence[str]) -> Itera
 
 
 def write_text(path: str | os.PathLike[str], text: str, *, into: Transaction | None = None) -> None:
-    """Write a text in UTF-8. Raises `FileError`."""
+    """Write a text file in UTF-8. Raises `FileError`."""
     write_pieces(path, [text.encode()], into)

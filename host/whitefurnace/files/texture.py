@@ -1,4 +1,4 @@
-"""A texture as containers hold it: mip levels of a 2-D image, a cube or an array of either, in one pixel format."""
+"""The texture type of all containers: mip levels of a 2-D image, a cube, or an array of either, in one pixel format."""
 
 from __future__ import annotations
 
@@ -12,17 +12,20 @@ from whitefurnace.files.binary import MAX_BYTES, Buffer, Source
 from whitefurnace.files.packing import FORMATS, format_named
 
 MAX_SIDE = 65536
-MAX_LAYERS = 2048  # of Direct3D 11 and, at least, of Vulkan
+MAX_LAYERS = 2048  # the limit of Direct3D 11, and the least limit of Vulkan
 
 
 @dataclass(frozen=True)
 class Texture:
-    """What a reader returns and a writer takes.
+    """A texture as readers return it and writers take it.
 
-    `levels[k]` are the bytes of level k, max(1, width >> k) x max(1, height >> k) texels, without any padding: layers,
-    in each its faces (+X -X +Y -Y +Z -Z), in each its rows. `layers` is 0 for what is not an array; `faces` 1 or 6.
-    `key_values` are values as stored (a text ends with a NUL: `text_value`), without the key of the orientation.
-    `orientation` says where a row's texels and the rows go: "rd", right and down, is the one of GL-direct faces.
+    format       name of the pixel format, a key of `packing.FORMATS`
+    levels       `levels[k]` are the bytes of level k, max(1, width >> k) x max(1, height >> k) texels without padding;
+                 the order is layers, in each its faces (+X -X +Y -Y +Z -Z), in each its rows
+    layers       0 where the texture is not an array
+    faces        1, or 6 for a cube
+    key_values   values as stored (a text ends with a NUL: `text_value`), without the key of the orientation
+    orientation  direction of texels in a row and of the rows; "rd", right and down, is that of GL-direct faces
     """
 
     format: str
@@ -47,35 +50,35 @@ class Texture:
         return self.faces == 6
 
     def extent(self, k: int) -> tuple[int, int]:
-        """Width and height of level k in texels."""
+        """Return the width and height of level k in texels."""
         return max(self.width >> k, 1), max(self.height >> k, 1)
 
     def level_bytes(self, k: int) -> int:
+        """Return the bytes of level k, all layers and faces."""
         return level_bytes(self.format, self.width, self.height, k) * max(self.layers, 1) * self.faces
 
 
 def upright(texels: npt.NDArray[np.float32], orientation: str) -> npt.NDArray[np.float32]:
-    """Texels (..., height, width, channels) of a texture of that orientation with their rows from the top and each row
-    from the left."""
+    """Turn texels (..., height, width, channels) of a texture with `orientation` to rows from the top and left."""
     if "u" in orientation:
         texels = texels[..., ::-1, :, :]
     return texels[..., ::-1, :] if "l" in orientation else texels
 
 
 def text_value(text: str) -> bytes:
-    """A key's value that is a text: UTF-8 with a NUL at its end."""
+    """Encode a text as the value of a key: UTF-8 that ends with a NUL."""
     return text.encode() + b"\0"
 
 
 def level_bytes(form: str, width: int, height: int, k: int) -> int:
-    """Bytes of one face of level k, whole blocks."""
+    """Return the bytes of one face of level k, in whole blocks."""
     kind = FORMATS[form]
     columns, rows = (-(-max(side >> k, 1) // kind.block) for side in (width, height))
     return columns * rows * kind.size
 
 
 def misfit(width: int, height: int, layers: int, faces: int, levels: int) -> str:
-    """What is wrong with these numbers of a texture, to end a sentence; empty where nothing is."""
+    """Return the error in the dimensions of a texture as the end of a sentence; an empty text where there is none."""
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         return f"is of {width} x {height} texels, 1 to {MAX_SIDE} a side are allowed"
     if faces not in (1, 6):
@@ -91,8 +94,10 @@ def misfit(width: int, height: int, layers: int, faces: int, levels: int) -> str
 
 
 def check_header(source: Source, form: str, width: int, height: int, layers: int, faces: int, levels: int) -> list[int]:
-    """The bytes of each level that a header describes, unpacked. Raises `InputError` for what no texture has, or has
-    in more than 8 GiB."""
+    """Return the unpacked bytes of each level that a header describes.
+
+    Raises `InputError` for dimensions that no texture has, and for more than 8 GiB.
+    """
     if complaint := misfit(width, height, layers, faces, levels):
         raise source.wrong(f"its header says that it {complaint}")
     sizes = [level_bytes(form, width, height, k) * max(layers, 1) * faces for k in range(levels)]

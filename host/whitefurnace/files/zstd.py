@@ -1,18 +1,24 @@
-"""Zstandard, and the only importer of `zstandard`: what comes out of a frame is never more than was asked for."""
+"""Compresses and decompresses with Zstandard. A frame is never unpacked to more bytes than the caller expects.
+
+Only this module imports `zstandard`.
+"""
 
 from __future__ import annotations
 
 from whitefurnace.files.binary import Buffer, Source
 
 _PIECE = 1 << 20
-# RFC 8878, 3.1.1.2: a block of at most 128 KiB takes at least 4 bytes (a header of 3, and of an RLE block 1).
+# RFC 8878, 3.1.1.2: a block of at most 128 KiB takes at least 4 bytes, 3 of its header and 1 of an RLE block.
 MAX_RATIO = 32768
-# RFC 8878, 3.1.1.1.2: decoders should take windows of 8 MiB; the library's own highest levels use up to 128 MiB.
+# RFC 8878, 3.1.1.1.2: decoders should accept windows of 8 MiB; the library's highest levels use up to 128 MiB.
 _WINDOWS = (8 << 20, 128 << 20)
 
 
 def compress(data: Buffer, level: int) -> bytes:
-    """One frame that states its size and has no checksum (the file's digest is in the manifest). `level` 1 to 22."""
+    """Compress `data` at `level`, 1 to 22, to one frame that states its size and has no checksum.
+
+    No checksum is needed because manifests hold the digest of the file.
+    """
     import zstandard
 
     if not 1 <= level <= 22:
@@ -21,8 +27,11 @@ def compress(data: Buffer, level: int) -> bytes:
 
 
 def decompress(data: Buffer, size: int, source: Source, what: str) -> bytearray:
-    """The frame `data`, which must hold exactly `size` bytes. Memory grows with what comes out, a piece at a time, and
-    no further than `size`. Raises `InputError` that names `what` of `source`."""
+    """Decompress the frame `data`, which must hold exactly `size` bytes.
+
+    Memory grows with the output, piece by piece, to no more than `size`. Raises `InputError`, which names `what` of
+    `source`.
+    """
     import zstandard
 
     if size > len(data) * MAX_RATIO:
