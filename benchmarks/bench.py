@@ -3,7 +3,7 @@ environment in the folder WHITEFURNACE_ENVIRONMENTS names: `whitefurnace bench` 
 
     python benchmarks/bench.py [-n RUNS] [--markdown | --readme] [--plot DIR]
 
---readme writes the tables into README.md and the plot beside this file.
+--docs writes the tables into docs/bench.md and the plot into docs/pictures.
 """
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-README = HERE.parent / "README.md"
+PAGE = HERE.parent / "docs/bench.md"
 
 
 def environments() -> list[str]:
@@ -96,20 +96,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-n", "--runs", type=int, default=5)
     parser.add_argument("--markdown", action="store_true")
-    parser.add_argument("--readme", action="store_true")
+    parser.add_argument("--docs", action="store_true")
     parser.add_argument("--plot", metavar="DIR")
     options = parser.parse_args()
-    folder = str(HERE) if options.readme else options.plot
+    folder = str(PAGE.parent / "pictures") if options.docs else options.plot
     runs = ["--runs", str(options.runs)]
     parts = {"throughput": throughput(bench(*runs)),
              "tradeoff": tradeoff(bench("tradeoff", *environments(), *runs, *(["--plot", folder] if folder else [])))}
     for name, part in parts.items():
-        if options.readme:
-            text = README.read_text("utf-8")
+        if options.docs:
+            text = PAGE.read_text("utf-8")
             block = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(<!-- end -->)", re.DOTALL)
             if not block.search(text):
-                sys.exit(f"README.md has no <!-- {name}: … --> … <!-- end -->")
-            README.write_text(block.sub(lambda found, part=part: found[1] + markdown(*part) + "\n" + found[2], text),
+                sys.exit(f"docs/bench.md has no <!-- {name}: … --> … <!-- end -->")
+            PAGE.write_text(block.sub(lambda found, part=part: found[1] + markdown(*part) + "\n" + found[2], text),
                               "utf-8")
         print(markdown(*part) if options.markdown else plain(*part), end="\n\n")
 

@@ -1,6 +1,7 @@
-"""The README is true: its commands run, its Python runs, its generated parts are what the program says."""
+"""The documents are true: their commands and their Python run, their generated parts are what the program says."""
 from __future__ import annotations
 
+import ast
 import contextlib
 import io
 import re
@@ -8,15 +9,20 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import documents
-from whitefurnace.cli import main
-from whitefurnace.engines.presets import user_engine
+import whitefurnace
+from whitefurnace.cli import cli, main
+from whitefurnace.engines.presets import ENGINES, user_engine
+from whitefurnace.files import write_exr
 from whitefurnace.sphere.environments import LAYOUTS
 
 ROOT = Path(__file__).resolve().parents[1]
-README = (ROOT / "README.md").read_text("utf-8")
+PAGES = {page.relative_to(ROOT).as_posix(): page.read_text("utf-8") for page in documents.pages()}
+README = PAGES["README.md"]
+COMMANDS = sorted(cli.list_commands(None))  # type: ignore[arg-type]
 
 
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -30,6 +36,13 @@ def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess
     return subprocess.CompletedProcess(arguments, 0, out.getvalue(), err.getvalue())
 
 
+def marked(page: str, name: str) -> str:
+    """The fenced block of a page that follows the comment `<!-- NAME: … -->`."""
+    found = re.search(rf"^<!-- {re.escape(name)}: [^\n]*-->\n```\w*\n(.*?)^```", PAGES[page], re.M | re.S)
+    assert found, f"{page} has no block marked {name}"
+    return found[1].strip("\n")
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory) -> Path:
     where = tmp_path_factory.mktemp("docs")
@@ -38,17 +51,26 @@ def folder(tmp_path_factory) -> Path:
 
 
 def test_there_are_commands_to_test():
-    assert len(documents.commands()) >= 5 and len(documents.python_blocks()) >= 1
+    assert len(documents.commands()) >= 50 and len(documents.python_blocks()) >= 3
 
 
-LONG = ("whitefurnace bake studio.hdr -o baked --fit read --levels 7",
-        "whitefurnace scene helmet.glb --for filament --environment", "whitefurnace verify smith",
-        "whitefurnace bench tradeoff")
+LONG = ("whitefurnace bake forest_1k.exr -o mine", "whitefurnace bake studio.hdr -o baked --as-read",
+        "whitefurnace bake studio.hdr -o baked --fit read", "whitefurnace bake studio.hdr -o baked --ndf",
+        "whitefurnace bake studio.hdr -o baked --tolerance 1e-4 --certify", "whitefurnace batch probes.toml --shard",
+        "whitefurnace bench ", "whitefurnace lut energy -o turquin", "whitefurnace lut ltc_1",
+        "whitefurnace render baked/demo.json --for filament",
+        "whitefurnace scene helmet.glb --for filament --environment", "whitefurnace verify hat.clh",
+        "whitefurnace verify smith")
 """Lines that compute for more than some seconds, however small their input."""
 
 
-@pytest.mark.parametrize("line", [pytest.param(line, id=line.text,
-                                               marks=pytest.mark.long if line.text.startswith(LONG) else ())
+def is_long(line: documents.Line) -> bool:
+    """Whether a line belongs to the long tests; of the pages of engines three are enough for the fast ones."""
+    of_an_engine = re.fullmatch(r"docs/engines/(?!README|filament|gltf|unreal)\w+\.md", line.page)
+    return line.text.startswith(LONG) or of_an_engine is not None
+
+
+@pytest.mark.parametrize("line", [pytest.param(line, id=line.text, marks=pytest.mark.long if is_long(line) else ())
                                   for line in documents.commands()])
 def test_a_command_of_the_documents_runs(line, folder):
     if before := documents.needed(line):
@@ -57,23 +79,29 @@ def test_a_command_of_the_documents_runs(line, folder):
     assert done.returncode in line.exit_codes, done.stderr
 
 
+@pytest.mark.whole
 @pytest.mark.parametrize("block", documents.python_blocks(), ids=lambda block: block.page)
 def test_the_python_of_the_documents_runs(block, folder):
     done = subprocess.run([sys.executable, "-c", block.text], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     # GGX's albedo at α = .25 lies between .9 and 1 at these angles; the rule is named
-    assert "gauss-" in done.stdout
+    assert ("gauss-" in done.stdout) == ("print(" in block.text)
 
 
 def test_the_table_of_models_is_what_the_program_lists():
-    listed = run("models")
-    written = README.partition("<!-- models:")[2].partition("```\n")[2].partition("```")[0]
-    assert written.strip("\n") == listed.stdout.strip("\n")
+    assert marked("docs/models.md", "models") == run("models").stdout.strip("\n")
 
 
-def test_the_table_of_engines_is_what_the_program_lists():
-    written = README.partition("<!-- engines:")[2].partition("```\n")[2].partition("```")[0]
-    assert written.strip("\n") == run("engines").stdout.strip("\n")
+@pytest.mark.parametrize("page", ["README.md", "docs/engines/README.md"])
+def test_the_table_of_engines_is_what_the_program_lists(page):
+    assert marked(page, "engines") == run("engines").stdout.strip("\n")
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("name", sorted(ENGINES))
+def test_every_engine_has_its_page(name):
+    assert marked(f"docs/engines/{name}.md", f"engine {name}") == run("engines", name).stdout.strip("\n")
+    assert f"]({name}.md)" in PAGES["docs/engines/README.md"]
 
 
 def test_the_engine_of_the_documents_is_one(folder):
@@ -83,29 +111,79 @@ def test_the_engine_of_the_documents_is_one(folder):
 
 
 def test_the_scene_of_the_documents_is_what_the_program_says(folder):
-    said = run("scene", "helmet.glb", cwd=folder).stdout
-    written = README.partition("<!-- scene:")[2].partition("```\n")[2].partition("```")[0]
-    assert written.strip("\n") == said.strip("\n")
+    assert marked("docs/scene.md", "scene") == run("scene", "helmet.glb", cwd=folder).stdout.strip("\n")
 
 
 def test_the_table_of_layouts_names_every_layout():
-    table = README.partition("| layout | aspect |")[2].partition("\n\n")[0]
+    table = PAGES["docs/bake.md"].partition("| layout | aspect |")[2].partition("\n\n")[0]
     for layout in LAYOUTS:
         assert f"| {layout.name} | {layout.columns}:{layout.rows} |" in table, layout.name
 
 
 def test_the_options_of_the_documents_exist():
-    told = "".join(run(command, "--help").stdout for command in ("bake", "lut", "verify", "bench", "models", "devices",
-                                                                   "inspect", "compare", "render", "engines", "batch",
-                                                                   "scene"))
-    for option in set(re.findall(r"`(--[a-z-]+)", README)):
-        assert option in told, option
+    told = "".join(run(command, "--help").stdout for command in COMMANDS)
+    for page, text in PAGES.items():
+        if page == "docs/migrating-from-cmgen.md":  # the first column of its table has cmgen's options
+            text = re.sub(r"^\| [^|]*\|", "|", text, flags=re.M)
+        for option in set(re.findall(r"`(--[a-z-]+)", text)):
+            assert option in told, (page, option)
 
 
 def test_the_targets_of_the_documents_exist():
     makefile = (ROOT / "Makefile").read_text("utf-8")
-    for target in set(re.findall(r"\bmake ([a-z-]+)", README)) - {"and"}:
-        assert re.search(rf"^{target}:", makefile, re.M), target
+    for page, text in PAGES.items():
+        for target in set(re.findall(r"(?:`|^)make ([a-z-]+)", text, re.M)):
+            assert re.search(rf"^{target}:|^test.*\b{target}\b.*:", makefile, re.M), (page, target)
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors that a page's headings get, as forges make them."""
+    outside = re.sub(r"^```.*?^```", "", text, flags=re.M | re.S)
+    heads = re.findall(r"^#+ (.*)$", outside, re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("page", sorted(PAGES))
+def test_links_lead_somewhere(page):
+    outside = re.sub(r"^```.*?^```", "", PAGES[page], flags=re.M | re.S)
+    for link in re.findall(r"\]\(([^)\s]+)\)", outside):
+        assert not re.match(r"[a-z]+:|/", link), f"{link} is not relative"
+        path, _, anchor = link.partition("#")
+        target = (ROOT / page).parent / path if path else ROOT / page
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors(target.read_text("utf-8")), link
+
+
+@pytest.mark.whole
+@pytest.mark.parametrize("page", sorted(PAGES))
+def test_paths_in_the_documents_exist(page):
+    for path in re.findall(r"`((?:host|kernels|tests|benchmarks|docs)/[\w./-]+)`", PAGES[page]):
+        assert (ROOT / path).exists() or path.isupper() or re.search(r"[A-Z]{4}", path), path
+
+
+def test_the_readme_is_short():
+    assert len(README.splitlines()) <= 200
+
+
+def test_every_command_has_a_page_one_step_from_the_readme():
+    for command in COMMANDS:
+        row = re.search(rf"^\| `{command}` \|.*\]\((docs/[\w/-]+\.md)", README, re.M)
+        assert row, command
+        assert f"whitefurnace {command}" in PAGES[row[1]], (command, row[1])
+
+
+def test_every_page_is_in_the_index():
+    linked = set(re.findall(r"\]\(([\w/-]+\.md)\)", PAGES["docs/README.md"]))
+    pages = {page.removeprefix("docs/") for page in PAGES if page.startswith("docs/")} - {"README.md"}
+    assert {page for page in pages if not page.startswith("engines/")} | {"engines/README.md"} == linked
+
+
+def test_every_page_begins_with_a_command():
+    for page, text in PAGES.items():
+        if page.startswith("docs/") and page != "docs/README.md":
+            assert re.search(r"^(whitefurnace|make|import whitefurnace) ?", text[:2000], re.M), page
 
 
 def test_help_is_quick_to_import():
@@ -128,3 +206,28 @@ def test_the_diff_of_a_model_is_its_files():
     assert len(added) == 2
     for path, text in added.items():
         assert (ROOT / path).read_text("utf-8").splitlines() == text, path
+
+
+def test_the_preset_of_the_documents_is_its_file():
+    path = ROOT / "host/whitefurnace/engines/presets/bevy.py"
+    assert marked("docs/add-an-engine.md", "preset") == path.read_text("utf-8").strip("\n")
+
+
+def test_the_kind_of_the_documents_is_the_one_that_is_tested():
+    tree = ast.parse((ROOT / "tests/tables/test_kinds.py").read_text("utf-8"))
+    (kind,) = (node.value for node in tree.body if isinstance(node, ast.Assign)
+               and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "NEW_KIND")
+    assert marked("docs/add-a-table.md", "kind") == ast.literal_eval(kind).strip("\n")
+
+
+def test_cubes_are_turned_as_the_page_for_users_of_cmgen_says(tmp_path):
+    """The image's centre lies at +X, at +Z when turned by 90°, and what is right of it at +Z, then −X. cmgen reads
+    u = (atan2(x, z)/π + 1)/2 of the direction mirrored in x: at +Z u = ½, at −X ¾."""
+    image = np.full((64, 128, 3), 0.01, np.float32)
+    image[30:34, 62:66, 0] = 100
+    image[30:34, 94:98, 1] = 100
+    write_exr(tmp_path / "marks.exr", image)
+    for angle, wanted in ((0, (0, 4)), (90, (4, 1))):
+        environment = whitefurnace.environment(tmp_path / "marks.exr", rotate=angle)
+        level = whitefurnace.prefilter(environment, size=16, min_size=16, certify=0).values[0]
+        assert tuple(np.argmax(level[..., :2].mean((1, 2)), 0)) == wanted
