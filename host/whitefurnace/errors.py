@@ -1,5 +1,7 @@
-"""One tree of errors. A message says what, where, the allowed range and the nearest name; only the
-command line turns the class into an exit code."""
+"""The exceptions of this package. The command line turns each class into its exit code.
+
+A message names the wrong value and its place, and gives the allowed range or the nearest known name.
+"""
 from __future__ import annotations
 
 import difflib
@@ -7,60 +9,60 @@ from collections.abc import Iterable
 
 
 class WhitefurnaceError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base class of every error that this package raises on purpose."""
 
     exit_code = 1
 
 
 class UsageError(WhitefurnaceError):
-    """An option or argument that cannot be meant: unknown name, value out of its domain."""
+    """An invalid option or argument, such as an unknown name or a value out of its range."""
 
     exit_code = 1
 
 
 class FileError(WhitefurnaceError):
-    """A file that cannot be read or written: missing, no permission, disk full, somebody else's."""
+    """A file that cannot be read or written: missing, no permission, disk full, or not written by this tool."""
 
     exit_code = 2
 
 
 class InputError(WhitefurnaceError):
-    """A file or array that was read and is not valid input: truncated, corrupted, NaN, wrong shape."""
+    """A file or array that was read and is not valid: truncated, corrupted, with NaN, or of a wrong shape."""
 
     exit_code = 3
 
 
 class DeviceError(WhitefurnaceError):
-    """No OpenCL device gives right answers, or a kernel did not build or run."""
+    """No OpenCL device gives correct results, or a kernel did not build or run."""
 
     exit_code = 4
 
 
 class UnsupportedError(WhitefurnaceError):
-    """A valid request that this tool, or this combination of models, does not serve."""
+    """A valid request that this tool, or this combination of models, does not support."""
 
     exit_code = 5
 
 
 class CheckError(WhitefurnaceError):
-    """A tolerance was missed or a check failed."""
+    """A tolerance was not reached, or a check failed."""
 
     exit_code = 7
 
 
 class PartialError(WhitefurnaceError):
-    """Some of several items failed; the rest is done."""
+    """Some of several items failed; the others are done."""
 
     exit_code = 8
 
 
 def of_code(code: int) -> type[WhitefurnaceError] | None:
-    """The class with an exit code, or None."""
+    """Return the class of errors with an exit code, or None."""
     return next((kind for kind in WhitefurnaceError.__subclasses__() if kind.exit_code == code), None)
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:
-    """`; did you mean 'x'?` for the choice closest to `name`, or the list of choices, if there is any."""
+    """Return the end of an error message that suggests the choice closest to `name`, or lists all choices."""
     choices = list(choices)
     if not choices:
         return "; there is none"

@@ -1,5 +1,7 @@
-"""Small formulas of a roughness, as presets and users write them: one text that numpy evaluates and that is also
-written as GLSL, HLSL and WGSL, so that a baker and a shader cannot disagree."""
+"""Short formulas in presets and command lines, such as the level that an engine reads for a roughness.
+
+numpy evaluates the same text that is translated to GLSL, HLSL and WGSL, so the bake and the shader agree.
+"""
 from __future__ import annotations
 
 import ast
@@ -15,9 +17,10 @@ import numpy as np
 from whitefurnace.errors import UsageError, nearest
 
 LONGEST = 1000
-"""Characters of a formula, 200 of its nodes: nothing that describes a mapping is longer."""
+"""Largest number of characters of a formula. Formulas of engines are far shorter."""
 
 MOST_NODES = 200
+"""Largest number of nodes in the syntax tree of a formula."""
 
 FUNCTIONS: Mapping[str, tuple[int, Callable[..., Any]]] = {
     "sqrt": (1, np.sqrt),
@@ -30,7 +33,7 @@ FUNCTIONS: Mapping[str, tuple[int, Callable[..., Any]]] = {
     "clamp": (3, lambda x, low, high: np.minimum(np.maximum(x, low), high)),
     "mix": (3, lambda a, b, t: a + (b - a) * t),
 }
-"""How many numbers each takes, and what it is in numpy."""
+"""Number of arguments and numpy function of each function in formulas."""
 
 _BINARY = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
 _COMPARE = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">="}
@@ -39,9 +42,9 @@ LANGUAGES = ("glsl", "hlsl", "wgsl")
 
 
 class Expression:
-    """A formula over `names`: numbers, + - * / **, parentheses, FUNCTIONS, and `a if r < b else c`.
+    """A formula of the variables `names`: numbers, + - * / **, parentheses, FUNCTIONS, and `a if r < b else c`.
 
-    Raises UsageError, which says where it stands (`where`), for what is none.
+    `where` names the place of the formula in error messages. Raises UsageError where `text` is not such a formula.
     """
 
     def __init__(self, text: str, names: Sequence[str], where: str = "formula") -> None:
@@ -67,17 +70,23 @@ class Expression:
 
     @cached_property
     def used(self) -> frozenset[str]:
-        """The names that stand in it."""
+        """The variables that occur in the formula."""
         called = {id(n.func) for n in ast.walk(self._tree) if isinstance(n, ast.Call)}
         return frozenset(n.id for n in ast.walk(self._tree) if isinstance(n, ast.Name) and id(n) not in called)
 
     def __call__(self, **values: Any) -> Any:
-        """Its value, float64 of the shape that `values` broadcast to; outside a function's domain NaN or ±inf."""
+        """Evaluate the formula, in float64 of the shape that `values` broadcast to.
+
+        The value is NaN or ±inf outside the domain of a function.
+        """
         with np.errstate(all="ignore"):
             return self._value(self._tree, {name: np.asarray(values[name], np.float64) for name in self.used})
 
     def shader(self, language: str, **names: str) -> str:
-        """It in a shading language, `names` in the place of its own."""
+        """Translate the formula to a shading language of LANGUAGES.
+
+        names: replacements of variables. Raises UsageError for an unknown language.
+        """
         if language not in LANGUAGES:
             raise UsageError(f"unknown shading language {language!r}{nearest(language, LANGUAGES)}")
         return self._written(self._tree, language, names)
@@ -150,7 +159,7 @@ class Expression:
             case ast.UnaryOp(op=op, operand=operand):
                 return f"(-{write(operand)})" if isinstance(op, ast.USub) else write(operand)
             case ast.BinOp(left=left, op=ast.Pow(), right=right):
-                # pow is undefined for x < 0 in all three; squares and cubes need none.
+                # pow is undefined for x < 0 in all three languages, so squares and cubes are products.
                 power = right.value if isinstance(right, ast.Constant) else None
                 if power == 2 or power == 3:
                     return "(" + " * ".join([write(left)] * (2 if power == 2 else 3)) + ")"
@@ -169,8 +178,11 @@ class Expression:
 
 
 def table_text(points: Sequence[Sequence[float]], name: str, where: str) -> str:
-    """The formula of a piecewise linear curve through (x, y) points, constant beyond its ends: each x larger than the
-    one before. Raises UsageError."""
+    """Return the formula of a piecewise linear curve through (x, y) points, constant beyond its ends.
+
+    points: two or more pairs of finite numbers with increasing x. name: the variable of the formula. Raises UsageError
+    for other points, with `where` as their place.
+    """
     rows = [tuple(float(x) for x in point) for point in points]
     if len(rows) < 2 or any(len(row) != 2 or not all(map(math.isfinite, row)) for row in rows):
         raise UsageError(f"{where}: a table has two or more pairs of finite numbers, as [[0, 0], [1, 4]]")

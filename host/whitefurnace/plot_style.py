@@ -1,4 +1,7 @@
-"""The look of every figure, and the only door to matplotlib: panels laid out on a page and written as PNG."""
+"""The common style of all figures: panels laid out on a page and written as PNG.
+
+Only this module imports matplotlib.
+"""
 from __future__ import annotations
 
 import contextlib
@@ -14,13 +17,13 @@ import numpy as np
 from whitefurnace.errors import CheckError, FileError, InputError, UnsupportedError
 from whitefurnace.files import write_atomic
 
-# matplotlib is an extra and slow to load: it is imported inside functions, and its types are not named here.
+# matplotlib is an optional dependency and slow to load: it is imported inside functions, and its types are Any here.
 Figure = Any
 Axes = Any
 
 DPI = 120
 STYLE: Any = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib and has every sign of the papers
+    "font.family": "DejaVu Sans",  # comes with matplotlib and has all mathematical symbols in use
     "font.size": 11,
     "axes.titlesize": 12,
     "axes.titlelocation": "left",
@@ -41,13 +44,13 @@ STYLE: Any = {
     "ytick.color": "0.25",
 }
 
-# Okabe and Ito's colours, apart for every kind of colour vision; red, green and blue of a metal among them.
+# Colours of Okabe and Ito, which are distinct for every kind of colour vision.
 GREEN, BLUE, RED = "#009E73", "#0072B2", "#D55E00"
 RGB = {"red": RED, "green": GREEN, "blue": BLUE}
 
 
 def require() -> None:
-    """Raises UnsupportedError where there is no matplotlib."""
+    """Raise UnsupportedError where matplotlib is not installed."""
     try:
         import matplotlib.figure  # noqa: F401
     except ImportError:
@@ -59,9 +62,9 @@ def drawing(path: Path, *, dpi: int | None = None, size: tuple[float, float] | N
             stated: Mapping[str, str] | None = None) -> Iterator[Figure]:
     """Give an empty figure in the common style and write it to `path` as PNG when the block ends.
 
-    The same drawing gives the same bytes, whatever matplotlibrc the machine has.
-    dpi: dots an inch, DPI by default. size: width and height in inches. stated: texts that are stored in the file.
-    Raises UnsupportedError without matplotlib, FileError where the folder or the file cannot be written.
+    The same drawing gives the same bytes; the matplotlibrc of the machine is ignored.
+    dpi: dots per inch, DPI by default. size: width and height in inches. stated: texts that are stored in the file.
+    Raises UnsupportedError without matplotlib, and FileError where the folder or the file cannot be written.
     """
     require()
     import matplotlib
@@ -85,21 +88,21 @@ def drawing(path: Path, *, dpi: int | None = None, size: tuple[float, float] | N
 
 
 def logarithmic_scale(low: float, high: float) -> Any:
-    """A logarithmic scale of colours from `low` to `high`."""
+    """Return a logarithmic colour scale from `low` to `high`."""
     from matplotlib.colors import LogNorm
 
     return LogNorm(low, high)
 
 
 def linear_scale(low: float, high: float) -> Any:
-    """A linear scale of colours from `low` to `high`."""
+    """Return a linear colour scale from `low` to `high`."""
     from matplotlib.colors import Normalize
 
     return Normalize(low, high)
 
 
 def colours_named(name: str, **extremes: Any) -> Any:
-    """A colour map of matplotlib by its name, with colours for values under, over or bad."""
+    """Return the matplotlib colour map `name`; `extremes` are its colours for values under, over or bad."""
     import matplotlib
 
     found = matplotlib.colormaps[name]
@@ -107,7 +110,7 @@ def colours_named(name: str, **extremes: Any) -> Any:
 
 
 def seconds_axis(axis: Any) -> None:
-    """Ticks closer than decades where measured times lie within one or two."""
+    """Set the ticks of a logarithmic axis of times: several ticks a decade where the axis spans one or two."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
     low, high = axis.get_view_interval()
@@ -118,7 +121,7 @@ def seconds_axis(axis: Any) -> None:
 
 
 def number_label(value: float) -> str:
-    """A number for a label: powers of ten as such."""
+    """Return the text of a number for a label: three digits, or a power of ten such as 10⁻³."""
     power = round(math.log10(abs(value))) if value else 0
     if abs(power) >= 3 and math.isclose(value, 10.0**power):
         return "10" + str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
@@ -126,13 +129,14 @@ def number_label(value: float) -> str:
 
 
 def small_label(value: float) -> str:
+    """Return the text of a small number for a label, such as 1.2×10⁻³."""
     mantissa, _, power = f"{value:.1e}".partition("e")
     superscript = str(int(power)).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
     return f"{mantissa}×10{superscript}" if value else "0"
 
 
 def shades(count: int) -> list[Any]:
-    """Colours in order, dark to light, none too light for white paper."""
+    """Return `count` colours from dark to light, none too light for a white page."""
     import matplotlib
 
     return [matplotlib.colormaps["viridis"](x) for x in np.linspace(0.0, 0.86, count)] if count > 1 else [BLUE]
@@ -140,24 +144,32 @@ def shades(count: int) -> list[Any]:
 
 @dataclass(frozen=True)
 class Panel:
-    """What paints one set of axes, their width and the room after them for a legend or a bar of colours, inches."""
+    """One set of axes on a page.
+
+    paint  the function that draws on the axes
+    width  width of the axes, inches
+    after  space right of the axes for a legend or a colour bar, inches
+    polar  first and last angle of polar axes, degrees; None for Cartesian axes
+    """
 
     paint: Callable[[Axes], None]
     width: float
     after: float = 0.3
     polar: tuple[int, int] | None = None
-    """First and last angle, degrees."""
 
 
 Page = Sequence[tuple[float, Sequence[Panel]]]
 """Rows of panels with their heights, inches."""
 
 HEAD, ABOVE, BELOW, LEFT = 0.75, 0.5, 0.65, 0.87
-LEAST = 10.0  # of the width: room for the heading
+LEAST = 10.0  # least width of a page, inches: room for the heading
 
 
 def lay_out(figure: Figure, page: Page) -> None:
-    """Every panel at its place in inches: panels of one row are alike whatever their labels take."""
+    """Place every panel on the figure, in inches, and paint it.
+
+    Positions do not depend on the size of labels, so the axes of a row have the same height.
+    """
     width = max(LEAST, *(sum(LEFT + p.width + p.after for p in row) for _, row in page))
     height = HEAD + sum(ABOVE + h + BELOW for h, _ in page)
     figure.set_size_inches(width, height)
@@ -175,13 +187,14 @@ def lay_out(figure: Figure, page: Page) -> None:
 
 
 def heading(figure: Figure, title: str, said: str, colour: str) -> None:
+    """Write the title of a page, and the line `said` under it in `colour`."""
     width, height = figure.get_size_inches()
     figure.text(0.25 / width, 1 - 0.2 / height, title, fontsize=18, fontweight="bold", va="top")
     figure.text(0.25 / width, 1 - 0.57 / height, said, fontsize=11, va="top", color=colour)
 
 
 def add_legend(axes: Axes, title: str = "", inside: str | tuple[float, float] | None = None) -> None:
-    """Beside the axes, or in a corner of them that the caller knows to be free."""
+    """Add a legend right of the axes, or at `inside` in the axes, where the caller knows of free space."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         inch = axes.figure.dpi / axes.bbox.width
@@ -193,7 +206,7 @@ def add_legend(axes: Axes, title: str = "", inside: str | tuple[float, float] | 
 
 
 def _try(axes: Axes, paint: Callable[[Axes], None]) -> None:
-    """A panel, or the reason why the model has none: one NDF without a Smith still has a shape."""
+    """Paint a panel, or write the reason where the model does not support it, so that the other panels are drawn."""
     try:
         paint(axes)
     except (UnsupportedError, InputError, CheckError) as error:
@@ -217,7 +230,7 @@ def _polar(figure: Figure, box: tuple[float, ...], low: int, high: int) -> Axes:
 
 
 def colour_bar(figure: Figure, axes: Axes, mesh: Any, label: str = "", **options: Any) -> None:
-    """The scale of colours, right beside its map."""
+    """Add a colour bar right of the axes of `mesh`."""
     inch = figure.dpi / axes.bbox.width
     bar = figure.colorbar(mesh, cax=axes.inset_axes([1 + 0.1 * inch, 0, 0.14 * inch, 1]), label=label, **options)
     bar.outline.set_visible(False)

@@ -1,4 +1,4 @@
-"""Results of integrals, as arrays with their stated error."""
+"""The result type of integrals: an array with its estimated error."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -11,10 +11,12 @@ import numpy as np
 class Integrated:
     """The result of `integrate`.
 
-    `values` has the broadcast shape of the parameters, with a trailing axis for a vector integral; `error` is
-    the estimated absolute error, the largest over all cells; `rule` names the finest rule that was used and
-    `evaluations` counts its integrand evaluations, all cells together; `seconds` is the wall time; `notices` say
-    what was done that was not asked for, such as cells taken to float64.
+    values       array of the broadcast shape of the parameters, with a trailing axis for a vector integral
+    error        estimated absolute error, the largest over all cells
+    evaluations  number of integrand evaluations of the finest rule, all cells together
+    seconds      wall time
+    rule         name of the finest quadrature rule that was used
+    notices      sentences about work that was not requested, such as cells computed in float64
     """
 
     values: np.ndarray

@@ -1,4 +1,4 @@
-"""Maps of the errors of one file against another, as a PNG."""
+"""Draws maps of the errors of one file against another, as PNG."""
 from __future__ import annotations
 
 import math
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
     from whitefurnace.inspection.comparison import Row as Compared
 
 CROSS = ((1, 2), (1, 0), (0, 1), (2, 1), (1, 1), (1, 3))
-"""Row and column of +X -X +Y -Y +Z -Z in a horizontal cross (environments.LAYOUTS)."""
+"""Row and column of the faces +X -X +Y -Y +Z -Z in a horizontal cross (environments.LAYOUTS)."""
 
 
 def draw_comparison(folder: Path, found: Comparison) -> Path:
-    """`folder`/compare.png: a map of the errors of each level, cubes as crosses, and of each channel of a table.
+    """Draw `folder`/compare.png: a map of the errors of each level and of each channel of a table.
 
-    Raises as `draw` does.
+    Cubes are drawn as crosses. Returns the path. Raises the errors of `plot_style.drawing`.
     """
-    # The colours of one file's maps are alike: five decades down from the worst.
+    # All maps of one kind have the same colour scale: five decades down from the largest error.
     shown = [row for row in found.rows if row.errors is not None]
     largest = {kind: max((row.worst for row in shown if row.kind == kind and math.isfinite(row.worst)), default=1.0)
                for kind in ("level", "table")}
@@ -63,7 +63,7 @@ def _error_map(figure: Figure, row: Compared, largest: float, axes: Axes) -> Non
     axes.set_yticks([])
     for side in axes.spines.values():
         side.set_visible(False)
-    flat = np.clip(flat, 1e-300, 1e300)  # the logarithm of 0, and of what is not finite in one file
+    flat = np.clip(flat, 1e-300, 1e300)  # keeps the logarithm finite for 0 and for infinite errors
     image = axes.imshow(np.ma.masked_invalid(flat), cmap=colours, norm=logarithmic_scale(1e-5 * largest, largest),
                         interpolation="nearest")
     roughness = "" if row.roughness is None else f", r = {row.roughness:.3g}"
