@@ -1,4 +1,4 @@
-"""Plan -> levels: runs the prefilter of one environment on a device, and the exact integrals that certify it."""
+"""Prefilters one environment on a device, and computes the exact integrals that certify the result."""
 from __future__ import annotations
 
 import hashlib
@@ -21,21 +21,21 @@ from whitefurnace.sphere.grids import POINTS, Shape, octahedral_means, source_di
 from whitefurnace.sphere.nearest import nearest_texels
 
 Progress = Callable[[str, float], None]
-"""Called with what is being done and its share of the whole, 0 to 1."""
+"""Called with the current activity and the share of the work that is done, 0 to 1."""
 
-# What a certified error may hide of its reference's rounding; the level's own is in what was measured. Float32 leaves
-# 1e-6 at the p99 and 2e-6 at most of a studio's levels, against float64; ten times that is added.
+# Added to a certified error for the rounding of its reference; the level's own rounding is in the measured error.
+# Against float64, float32 leaves 1e-6 at the p99 and 2e-6 at most of a studio's levels; ten times that is added.
 ROUNDING = {32: 2e-5, 64: 2e-7}
 
 SERIES = {32: 3e-7, 64: 3e-8}
-"""What a lobe's series may misplace of its energy."""
+"""Largest share of a lobe's energy that its series may misplace, by precision."""
 
 NEAR_TEXELS = 12.0
-"""Parts of texels, as masses at corrected centres resolve them, within which those are cut finely that a lobe much
-narrower than a texel needs."""
+"""Radius of the window of a lobe much narrower than a texel, in parts of texels. Texels within it are cut finely;
+beyond it, masses at corrected centres resolve the lobe."""
 
 MOST_TOGETHER = 4096
-"""Directions of exact integrals at a time: bounds memory, and a launch to a second."""
+"""Largest number of directions of exact integrals at a time. It bounds memory, and a launch to a second."""
 
 HARMONICS_CHUNK = 1024
 EXACT_SHARE = 0.3  # of the progress: the certificate's sums come first and take about this part of the time
@@ -43,10 +43,15 @@ EXACT_SHARE = 0.3  # of the progress: the certificate's sums come first and take
 
 @dataclass(frozen=True)
 class Level:
-    """One finished level: texels (6, size, size, 3) or lat-long (size, 2 size, 3), float32, and its statement.
+    """One finished level and its stated errors.
 
-    `error` bounds the 99th percentile of texel errors at 95 % confidence, `worst` is the largest seen, `rmse`
-    the relative RMSE; `grid` and `method` say how it was made; `seconds` is wall time, certificate included.
+    texels     (6, size, size, 3) or lat-long (size, 2 size, 3) float32 linear radiance
+    roughness  perceptual roughness
+    error      bound on the 99th percentile of the texel errors, at 95 % confidence
+    worst      largest texel error that was seen; `rmse`: relative RMSE
+    method     how the level was made; `grid`: nodes a face edge of its source grid
+    pairs      lobe evaluations
+    seconds    wall time, with the certificate
     """
 
     texels: np.ndarray
@@ -61,9 +66,11 @@ class Level:
 
 
 class Convolver:
-    """One environment on one device: the levels of its chain and the exact integrals they are certified by.
+    """Prefilters one environment on one device.
 
-    `texels` holds the environment as kernels read it; values are scaled by `scale` (a power of two) throughout.
+    precision: 32 or 64 bits; 32 where the device has no float64. seed: of the certificates' samples. progress: called
+    while work is done. `texels` is the environment as kernels read it; all values are scaled by `scale`, a power of
+    two.
     """
 
     def __init__(self, device: Device, environment: Environment, *, precision: int = 32, seed: str = "",
@@ -87,8 +94,8 @@ class Convolver:
         self._harmonics: dict[int, np.ndarray] = {}  # 9 × 3 coefficients and ∑w, by cuts
 
     def prepare(self, n: int, cuts: int) -> None:
-        """Says which grid is the finest that a set of levels needs and how finely texels are cut for it, so that
-        none is made from the texels twice."""
+        """Announces the finest grid (n nodes an edge) that a set of levels needs and the texel cuts for it, so that no
+        grid is made from the texels twice."""
         self.texels.prepare(n, cuts)
 
     # ------------------------------------------------------------------------------------------- levels
@@ -104,7 +111,11 @@ class Convolver:
 
     def convolve(self, lobe: Lobe, shape: Shape, n: int, tolerance: float,
                  share: tuple[float, ...] = (0.0, 1.0)) -> np.ndarray:
-        """The level over all directions of `shape` from the n × n grid and the bright texels, (dims, 3)."""
+        """The level over all texels of `shape`, (dims, 3) float32, from the n × n grid and the bright texels.
+
+        tolerance: of the level's error. share: progress before and after. Raises ValueError for an n that is not a
+        multiple of 16.
+        """
         if n % 16:
             raise ValueError(f"a grid of {n} nodes an edge is not a multiple of the tiles' 16")
         self.prepare(n, planning.cuts_for(self.texel, lobe.alpha, tolerance, self.share, self.texels.centred))
@@ -152,7 +163,7 @@ class Convolver:
             self.progress(lobe.name, share[0] + (share[1] - share[0]) * min(done * 8 * exchanges / shape.count, 1.0))
 
     def interpolate(self, level: Buffer, shape: Shape, grid: Buffer) -> None:
-        """The texels of `shape` from values at nodes, the base added."""
+        """Writes into `level` the texels of `shape`, read from values at the nodes of `grid`, with the base added."""
         kernel = self.device.build(source.interpolation().text, {
             "W": 1, "T": 1, "PRECISION": self.precision}).kernel("interpolate")
         size = self.device.scalar_size
@@ -165,10 +176,12 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- exact integrals
 
     def exact(self, wanted: Sequence[tuple[Lobe, np.ndarray]], cuts: int, tolerance: float = 1e-3) -> list[np.ndarray]:
-        """For each (lobe, directions (3, m)): the integral over every texel, (m, 3) float64, in one pass.
+        """Exact values of lobes in given directions: the integral over every source texel, (m, 3) float64 each, in one
+        pass.
 
-        Bright texels are cut twice as fine as in `convolve`. The spherical harmonics of the same nodes
-        are kept where `harmonics` will ask for them.
+        wanted: (lobe, directions (3, m)) pairs. cuts: nodes an edge of each texel; bright texels are cut twice as
+        finely as in `convolve`. tolerance: that of the level. The spherical harmonics of the same nodes are kept where
+        `harmonics` needs them.
         """
         if any(directions.shape[1] > MOST_TOGETHER for _, directions in wanted):  # of a certificate of many texels
             pieces = [np.array_split(directions, -(-directions.shape[1] // MOST_TOGETHER), 1)
@@ -195,8 +208,10 @@ class Convolver:
                 for (lobe, block), total, (_, directions) in zip(jobs, sums, wanted, strict=True)]
 
     def exact_narrow(self, lobe: Lobe, directions: np.ndarray, cuts: int, tolerance: float) -> np.ndarray:
-        """`exact` for a lobe much narrower than a texel: near its direction texels are cut finely, beyond a window that
-        their larger parts resolve they are not."""
+        """As `exact`, for one lobe that is much narrower than a texel.
+
+        Texels are cut finely only near the lobe's direction; beyond a window, larger parts resolve the lobe.
+        """
         parts = self.texels.centred
         reach = min(NEAR_TEXELS * self.texel / parts, 1.0)
         q1 = 2 - 2 * math.cos(reach)
@@ -217,7 +232,7 @@ class Convolver:
         return self._value(lobe, block, sums, tolerance, directions.shape[1])
 
     def on_grid(self, lobe: Lobe, directions: np.ndarray, n: int, tolerance: float) -> np.ndarray:
-        """As `exact` for one lobe, over the n × n grid instead of every texel."""
+        """As `exact` for one lobe, over the n × n grid in place of every texel."""
         if directions.shape[1] > MOST_TOGETHER:
             pieces = np.array_split(directions, -(-directions.shape[1] // MOST_TOGETHER), 1)
             return np.concatenate([self.on_grid(lobe, piece, n, tolerance) for piece in pieces])
@@ -284,9 +299,11 @@ class Convolver:
         return 2 * math.ceil(self.texel / 0.05)  # pairs of Gauss points on .05 rad: 2e-8 for these polynomials
 
     def harmonics(self) -> tuple[np.ndarray, float]:
-        """Radiance coefficients (9, 3) in float64 from nodes of every texel, and their error over the largest
-        L00: the difference to nodes of twice as many an edge on a small image, else to the finest grid, another
-        quadrature of the same texels; and float32's part."""
+        """Radiance coefficients (9, 3) float64 from nodes of every texel, and their error over the largest L00.
+
+        The error is the difference to another quadrature of the same texels, with twice as many nodes an edge on a
+        small image, else the finest grid, plus float32's rounding.
+        """
         cuts = self._harmonic_cuts
         if cuts not in self._harmonics:
             self.exact([], cuts)
@@ -306,14 +323,14 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- level 0
 
     def exact_means(self, shape: Shape, index: np.ndarray) -> np.ndarray:
-        """The mean of the source over chosen texels of `shape`, (m, 3), in float64 and in another form."""
+        """The mean of the source over chosen texels of `shape`, (m, 3) float64, by another method than `means`."""
         if shape.octahedral:
             return octahedral_means(self.environment, shape, index, POINTS[1]) * self.scale
         return self.overlaps.exact(shape, index)
 
     def means(self, shape: Shape) -> np.ndarray:
-        """The mean source radiance over each texel of `shape`, (dims, 3) float32, by exact overlaps; of octahedral maps
-        by points, whose error the certificate finds."""
+        """The mean source radiance over each texel of `shape`, (dims, 3) float32: by exact overlaps, or for octahedral
+        maps by points, whose error the certificate finds."""
         if shape.octahedral:
             index = np.arange(shape.count)
             means = octahedral_means(self.environment, shape, index, POINTS[0]) * self.scale
@@ -336,7 +353,7 @@ class Convolver:
         return uniform, self._near_bright(shape)
 
     def _near_bright(self, shape: Shape) -> np.ndarray:
-        """The NEAR_BRIGHT texels nearest the brightest sources, nearest to any of them."""
+        """Indices of the NEAR_BRIGHT texels nearest to any of the brightest sources."""
         if self.constant:
             return np.arange(0)
         return nearest_texels(shape, source_directions(self.environment, self.texels.brightest).T, planning.NEAR_BRIGHT)

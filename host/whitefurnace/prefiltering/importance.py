@@ -1,4 +1,4 @@
-"""Levels by filtered importance sampling: N samples of the lobe a texel, each read from a pyramid of means."""
+"""Computes levels by filtered importance sampling: each texel takes N samples of the lobe from a pyramid of means."""
 from __future__ import annotations
 
 import math
@@ -17,21 +17,23 @@ from whitefurnace.sphere.environments import channel_range, cube_solid_angles
 from whitefurnace.sphere.grids import Shape
 
 LARGEST_SOURCE = 1024
-"""Texels a face edge of a pyramid's first level at most: 135 MB of float32 with its pad, frame and coarser levels."""
+"""Largest face edge of a pyramid's first level in texels: 135 MB of float32 with its pad, frame and coarser levels."""
 
 CROWDED = 4
-"""Samples on one texel of the first level, where the lobe is densest, from which a pyramid of twice the size is read:
-its bilinear reads blur a sharp lobe by a quarter of a texel's square, which more samples do not mend. A 1K studio at
-α = .018 has .58 % RMSE at 1 024 samples from 256² and .15 % from 512², which costs 50 ms; .50 % and .14 % at 16 384."""
+"""Number of samples on one texel of the first level, where the lobe is densest, from which a pyramid of twice the size
+is read. Its bilinear reads blur a sharp lobe by a quarter of a texel's square, which more samples do not reduce. A 1K
+studio at α = .018 has .58 % RMSE at 1 024 samples from 256² and .15 % from 512², which costs 50 ms; .50 % and .14 % at
+16 384."""
 
 CHUNK = 1024
-"""Samples of one partial sum: bounds float32 rounding to 4e-6, far below what as many samples leave."""
+"""Number of samples in one partial sum. It bounds float32 rounding to 4e-6, far below the error of as many samples."""
 
 SAMPLES_A_LAUNCH = 1 << 26
-"""Samples of all outputs of one launch: about 0.2 s on two cores, so that Ctrl-C is heard."""
+"""Number of samples of all outputs of one launch: about 0.2 s on two cores, so that Ctrl-C takes effect."""
 
 INTERVALS = 4096
-"""Of the table of a lobe's energy: 12 e-folds of angle in as many steps leave 1e-6 of the density between them."""
+"""Number of intervals of the table of a lobe's energy. 12 e-folds of angle in as many steps leave 1e-6 of the density
+between them."""
 
 STEEPEST = 0.75 * math.log2(3)
 """How many levels higher a sample is read at a cube's corner than at the middle of a face."""
@@ -42,12 +44,14 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 class Sampler:
     """Filtered importance sampling [Krivanek2008; Colbert2007, GPU Gems 3, ch. 20] of one environment.
 
-    The environment is a cube of exact means over its texels, with a pyramid of means above it; sums are of what lies
-    above the least radiance of each channel, so that a constant environment comes out exactly. `precision` is that of
-    the kernels: float32 leaves 4e-6. `progress` is called with a lobe's name and a share of the whole.
+    The environment is a cube of exact means over its texels, with a pyramid of means above it. Sums are over the
+    radiance above the smallest value of each channel, so that a constant environment comes out exactly.
 
-    Every texel uses the same samples, in frames that turn slowly from texel to texel: a random turn of each leaves the
-    RMSE as it is (32 to 1 024 samples, four environments) and turns errors that neighbours share into noise.
+    Every texel uses the same samples, in frames that turn slowly from texel to texel. A random turn of each texel
+    leaves the RMSE as it is (32 to 1 024 samples, four environments) and turns errors that neighbours share into noise.
+
+    precision: of the kernels, in bits; float32 leaves 4e-6. progress: called with a lobe's name and a share of the
+    whole.
     """
 
     def __init__(self, means: Means, precision: int = 32,
@@ -73,7 +77,7 @@ class Sampler:
         self.device.launch(self._kernel(name, 1), (-(-count // size) * size,), args)
 
     def pyramid(self, size: int) -> Buffer:
-        """Every level of the pyramid that begins at `size` texels a face edge, as `pyramid.cl` lays it out."""
+        """All levels of the pyramid that begins at `size` texels a face edge, in the layout of `pyramid.cl`."""
         if size not in self._pyramids:
             texels = self.device.array(self.means.level(Shape(False, size)))
             levels = size.bit_length()
@@ -89,9 +93,9 @@ class Sampler:
         return self._pyramids[size]
 
     def level(self, lobe: Lobe, shape: Shape, count: int, share: tuple[float, ...] = (0.0, 1.0)) -> np.ndarray:
-        """The level over all directions of `shape` by `count` samples, (dims, 3) float32, in the units of the means.
+        """The level over all texels of `shape` by `count` samples each, (dims, 3) float32, in the units of the means.
 
-        share: the progress before and after.
+        share: progress before and after.
         """
         device = self.device
         table, flat, size = self._table(lobe, count)
@@ -132,16 +136,19 @@ class Sampler:
 
 
 def light_samples(lobe: Lobe, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`count` directions l in the frame of n = v (count, 3), their shares of the result (sum 1) and the solid angle
-    that each stands for, 1/(count · pdf), float64.
+    """(directions (count, 3), shares (count,), solid angles (count,)) of a lobe's samples, float64.
 
-    Half vectors have the density D(h)(n·h) of the NDF, within 45° of n since others reflect below the horizon. With
-    θ_l = 2θ_h, dω_l = 4 (n·h) dω_h, so that pdf(l) = D/(4 ∫ D (n·h) dω_h) and what is left of K = D(h)(n·l) is n·l
-    [Karis2013, "Real Shading in Unreal Engine 4"]. Where a mixture of lobes is negative, |D| is sampled and its sign
-    goes with the share. Irradiance's directions have the density n·l/π and equal shares.
+    Directions l are in the frame of n = v. The shares weigh the samples and sum to 1. A sample stands for the solid
+    angle 1/(count · pdf).
 
-    A lattice of two dimensions: equal steps of energy, azimuths by the golden ratio, whose points keep their distance
-    at every count [Vogel1979]; it leaves two thirds of the error of Hammersley's points (four environments).
+    Half vectors have the density D(h)(n·h) of the NDF, within 45° of n, since others reflect below the horizon. With
+    θ_l = 2θ_h, dω_l = 4 (n·h) dω_h, so pdf(l) = D/(4 ∫ D (n·h) dω_h), and the weight that remains of K = D(h)(n·l) is
+    n·l [Karis2013, "Real Shading in Unreal Engine 4"]. Where a mixture of lobes is negative, |D| is sampled and its
+    sign goes into the share. Directions of irradiance have the density n·l/π and equal shares.
+
+    The samples are a two-dimensional lattice: equal steps of energy, and azimuths by the golden ratio, whose points
+    keep their distance at every count [Vogel1979]. It leaves two thirds of the error of Hammersley's points (four
+    environments).
     """
     u = (np.arange(count) + 0.5) / count
     phi = 2 * math.pi * np.mod(np.arange(count) * GOLDEN, 1.0)
@@ -155,7 +162,7 @@ def light_samples(lobe: Lobe, count: int) -> tuple[np.ndarray, np.ndarray, np.nd
         D = lobe.density(4 * half)
         sine, z = 2 * np.sqrt(half * (1 - half)), 1 - 2 * half
         share = z * np.sign(D)
-        # A D of 0 beside a step of the table would stand for more than the sphere: it is read from the last level.
+        # Next to a step of the table, D = 0 would mean a solid angle larger than the sphere. It is read from the last level.
         solid_angle = 8 * math.pi * energy[-1] / (count * np.maximum(np.abs(D), energy[-1] * 1e-12))
     return np.stack([sine * np.cos(phi), sine * np.sin(phi), z], 1), share / share.sum(), solid_angle
 

@@ -1,16 +1,16 @@
-"""Kernels of levels for what engines read between levels: `--fit read`.
+"""Fits the levels of a chain so that interpolated roughness values are most accurate (`--fit read`).
 
-An engine reads roughness r at lod(r) linearly between two levels. Whatever the levels hold, that is a sum of two fixed
-kernels, and the mean of a narrow and a wide lobe is neither: GGX's tail grows as α², so between exact levels it is up
-to twice the true one. Each level k but the first gets a mixture ∑_j c_kj K_{r_j}/∫K_{r_j} of the same NDF's lobes
-with ∑_j c_kj = 1 instead, so chosen that the read is best.
+An engine reads roughness r at lod(r), linearly between two levels. The result is a sum of two fixed kernels, and the
+mean of a narrow and a wide lobe is not the lobe between them: GGX's tail grows as α², so between exact levels it is up
+to twice the true one. Here each level k but the first gets a mixture ∑_j c_kj K_{r_j}/∫K_{r_j} of the same NDF's lobes,
+with ∑_j c_kj = 1, that makes the read most accurate.
 
-No environment is needed for that. For the L² error of any one environment the best mixtures would be the least-squares
-spline of the lobe's transform over r, the same for every degree. The error that is seen is relative, so it depends on
-how much of the light in a direction comes from how far away; that is what the scenes below span: a disc of angular
-radius ρ over a background that is β of it, seen at every angle. A disc is zonal, so its exact lobes are 1-D integrals,
-and the whole fit takes some 10 ms for GGX in 5 levels, 150 for a dear NDF or 12 levels. Real environments take no part
-in it and test it (tests/test_reading.py).
+The fit needs no environment. For the L² error of any one environment the best mixtures would be the least-squares
+spline of the lobe's transform over r, the same for every degree. But the error that matters is relative, so it depends
+on how far away the light of a direction comes from. The scenes below cover this: a disc of angular radius ρ over a
+background that is β of it, seen at every angle. A disc is zonal, so its exact lobes are 1-D integrals, and the whole
+fit takes about 10 ms for GGX in 5 levels, 150 ms for a costly NDF or 12 levels. Real environments are not used in the
+fit; they test it (tests/prefiltering/test_reading.py).
 """
 from __future__ import annotations
 
@@ -27,28 +27,29 @@ from whitefurnace.opencl.launch import evaluate
 from whitefurnace.prefiltering.recipe import Chain
 
 DISCS = (0.03, 0.1, 0.3, 0.6, 1.0, 1.4)
-"""ρ in radians, from a sun's glare to half the sky."""
+"""Radii ρ of the discs in radians, from a sun's glare to half the sky."""
 
 BACKGROUNDS = (1e-3, 1e-2, 1e-1)
-"""β: from a studio's darkness, on which the metric's floor of 1e-3 lies, to a clouded sky."""
+"""Backgrounds β, from a studio's darkness, the metric's floor of 1e-3, to a clouded sky."""
 
 OFFSETS = (-0.5, -0.25, 0.0, 0.25, 0.5, 1.0)
-"""Nodes r_j of level k in steps of lod around k; more of them, or farther ones, gain less than 1 % of the error."""
+"""Nodes r_j of level k, as steps of lod from k. More or farther nodes reduce the error by less than 1 %."""
 
 SHARPEST = 1.0
-"""No node below this lod, so that no level holds a sharper lobe than the first lobe of the chain: one at .75 would gain
-another 5 % on a studio and take a source grid twice as fine."""
+"""Smallest lod of a node, so that no level has a sharper lobe than the first lobe of the chain. A node at .75 would
+reduce the error on a studio by another 5 % and need a source grid twice as fine."""
 
 FEWEST, MOST, TOGETHER = 3, 8, 32
 """Values of r between two levels at which a read is scored, TOGETHER over all but no fewer and no more than these:
 midpoints in lod, each for the range of r it stands for."""
 
 LEAST = 0.05
-"""A mixture is nowhere less than this share of the level's own lobe, so that no direction of light counts negative."""
+"""A mixture is nowhere less than this share of the level's own lobe, so that light from no direction counts as
+negative."""
 
 RIDGE = 1e-8
-"""Pull towards the level's own lobe, relative to each node's own weight in the sums: neighbouring nodes are nearly
-alike, and without it weights of ±10 buy the fourth digit."""
+"""Weight of the pull towards the level's own lobe, relative to each node's own weight in the sums. Neighbouring nodes
+are nearly alike, and without the pull weights of ±10 would improve the fourth digit."""
 
 ROUNDS = 5
 FLOOR = 1e-3  # of the mean, below which errors are not relative any more: the texel error's
@@ -58,9 +59,10 @@ Mixture = tuple[tuple[float, float], ...]
 
 
 def read_mixtures(device: Device, recipe: Chain) -> tuple[Mixture | None, ...]:
-    """For each level of a chain the mixture of lobes that reads best; None for the first, which stays the exact mean.
+    """The best mixture of lobes for each level of a chain, so that interpolated roughness values are most accurate.
 
-    The NDF's lobes at any roughness come from its entry's reference, a user's from the device.
+    None for the first level, which stays the exact mean. The NDF's lobes come from the reference of its entry, a user's
+    from the device.
     """
     mapping = (recipe.lods, recipe.size) if recipe.lods.lod else ()
     key = repr((sorted(recipe.ndf.canonical().items()), mapping))
@@ -125,11 +127,11 @@ def _within(radius: float, seen: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
-    """The mixtures of `levels` levels of the chain's mapping.
+    """The mixtures of a chain's levels, None for the first.
 
-    Minimises the sum over scenes of the mean over r of the RMS over directions of |read/exact - 1|, each scene
-    relative to what the levels' own lobes leave, by iteratively reweighted least squares (the square root of a sum of
-    squares weighs it by 1/RMS), under ∑_j c_kj = 1 and mixture ≥ LEAST × own lobe at every θ.
+    The fit minimises the sum over scenes of the mean over r of the RMS over directions of |read/exact - 1|, where each
+    scene is relative to the error of the levels' own lobes. It is an iteratively reweighted least-squares fit (the
+    square root of a sum of squares weighs it by 1/RMS), under ∑_j c_kj = 1 and mixture ≥ LEAST × own lobe at every θ.
     """
     if levels < 2:
         return (None,) * levels

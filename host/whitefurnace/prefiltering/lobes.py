@@ -1,4 +1,4 @@
-"""The lobes that environments are convolved with, and the short series that stands for each on a device."""
+"""Defines the lobes that environments are convolved with, and fits to each the short series that kernels evaluate."""
 from __future__ import annotations
 
 import math
@@ -15,19 +15,21 @@ from whitefurnace.opencl.derived import at_horizon, density_at, lobe_norm, numbe
 from whitefurnace.opencl.device import Device
 
 NODES = 64
-"""Chebyshev nodes at which a series is fitted; it keeps at most MOST_TERMS of as many terms."""
+"""Number of Chebyshev nodes at which a series is fitted. At most MOST_TERMS of as many terms are kept."""
 
 MOST_TERMS = 40
 
 CHECKS = 384
-"""Points from each end, as dense towards it as lobes are sharp or thin, at which a series is compared with its lobe."""
+"""Points, from each end, at which a series is compared with its lobe. They are as dense towards an end as lobes are
+sharp or thin there."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """P of `kernels/lobe_table.clh`: K = (1 - q/2)₊ x^power P(slope x - offset), x = 1/(q + shift).
+    """A series for a lobe, P of `kernels/lobe_table.clh`: K = (1 - q/2)₊ x^power P(slope x - offset), x = 1/(q +
+    shift).
 
-    `error` is ∫|K - its series| dω / ∫K dω, in exact arithmetic.
+    `error` is ∫|K - series| dω / ∫K dω in exact arithmetic.
     """
 
     shift: float
@@ -40,10 +42,13 @@ class Series:
 
 @dataclass(frozen=True)
 class Lobe:
-    """A lobe to convolve with: the cosine of irradiance (no summands), or one or several NDFs' at their parameters.
+    """A lobe K to convolve with: the cosine of irradiance, or the weighted sum of one or several NDFs' lobes.
 
-    `alpha` says how sharp it is and `horizon` how hard its kink where l sets, both as GGX's α has them; `norm` is
-    ∫K dω. `summands` holds for each NDF its model, its numbers for the kernels and its weight, which scales D.
+    summands  (NDF, its numbers for the kernels, the weight that scales D) of each; empty for irradiance
+    norm      ∫K dω
+    alpha     width of the lobe, as the α of a GGX lobe that is as sharp
+    horizon   strength of its kink where l sets, as the α of a GGX lobe with the same
+    density   D at q = |l - r|², float64: K = D (1 - q/2)₊
     """
 
     name: str
@@ -56,7 +61,7 @@ class Lobe:
 
     @cached_property
     def reach(self) -> float:
-        """The q beyond which a billionth of the lobe's integral lies; 2 at the most."""
+        """The q beyond which a billionth of the lobe's integral lies, at most 2."""
         edges = np.concatenate([[0.0], np.geomspace(1e-12, 2.0, 2001)])
         q = (edges[1:] + edges[:-1]) / 2
         energy = np.abs(self.density(q)) * np.maximum(1 - q / 2, 0) * np.diff(edges) * math.pi / self.norm
@@ -64,8 +69,10 @@ class Lobe:
         return float(edges[1:][np.flatnonzero(beyond > 1e-9)[-1]]) if (beyond > 1e-9).any() else 2.0
 
     def series(self, low: float, high: float, error: float) -> Series:
-        """The shortest series found for K on q in [low, high] that errs by at most `error` of its integral; the most
-        exact one of MOST_TERMS where none does."""
+        """The shortest series found for K on q in [low, high] whose error is at most `error` of the lobe's integral.
+
+        Where no series reaches that, the most accurate one of MOST_TERMS terms.
+        """
         whose = tuple((entry.name, entry.text, *rest) for entry, *rest in self.summands)
         key = (whose, error, low, high)
         if key not in _fitted:
@@ -80,7 +87,7 @@ _fitted: dict[Any, Series] = {}
 
 @cache
 def _chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes in [-1, 1] and the matrix from values there to coefficients."""
+    """(nodes in [-1, 1], matrix from the values at the nodes to the coefficients) of a Chebyshev series."""
     angle = (np.arange(count) + 0.5) * math.pi / count
     matrix = 2 / count * np.cos(np.outer(np.arange(count), angle))
     matrix[0] /= 2
@@ -132,7 +139,11 @@ def _fit(density: Callable[[np.ndarray], np.ndarray], norm: float, low: float, h
 
 
 def ndf_lobe(device: Device, choice: Chosen, roughness: float, parameters: Mapping[str, Any]) -> Lobe:
-    """The prefilter's lobe of an NDF; raises InputError for a user's that cannot be normalized."""
+    """The prefilter's lobe of an NDF.
+
+    roughness: perceptual. parameters: of the NDF, by name. Raises InputError for a user's NDF that cannot be
+    normalized.
+    """
     entry = choice.model
     rows = np.array([[parameters[p.name]] for p in entry.parameters], np.float64).reshape(-1, 1)
     numbers = tuple(numbers_of(device, entry, rows)[:, 0].tolist())
@@ -146,7 +157,11 @@ def ndf_lobe(device: Device, choice: Chosen, roughness: float, parameters: Mappi
 
 def mixture_lobe(device: Device, choice: Chosen, parts: Sequence[tuple[float, float]],
                  parameters: Callable[[float], Mapping[str, Any]]) -> Lobe:
-    """∑ weight K_r/∫K_r dω over (weight, r), the weights summing to 1: one lobe of norm 1."""
+    """The weighted sum of an NDF's normalized lobes at several roughness values, a lobe of norm 1.
+
+    parts: (weight, perceptual roughness) of each; the weights sum to 1. parameters: gives the NDF's parameters at a
+    roughness. Raises InputError for a user's NDF that cannot be normalized.
+    """
     lobes = [(weight, ndf_lobe(device, choice, r, parameters(r))) for weight, r in parts if weight != 0]
     summands = tuple((entry, numbers, weight / lobe.norm) for weight, lobe in lobes
                      for entry, numbers, _ in lobe.summands)

@@ -1,5 +1,5 @@
-"""Level 0: the mean of a source over each texel of a cube or a lat-long, by exact areas of overlap. What depends on the
-two grids alone is made once and kept for every image of the same size."""
+"""Computes the mean of a source over each texel of a cube or a lat-long (level 0) by exact areas of overlap. Data that
+depend on the two grids alone are made once and kept for every image of the same size."""
 from __future__ import annotations
 
 import itertools
@@ -17,22 +17,23 @@ from whitefurnace.sphere.grids import Shape, row_edges
 from whitefurnace.sphere.overlap import mean_over_texels
 
 OVERLAPS = 1 << 22
-"""Overlaps of a lat-long source's texels with a cube's that are in memory together: 64 MiB. Lists of no more are kept
-from image to image; longer ones are made again, part by part."""
+"""Largest number of overlaps of a lat-long source's texels with a cube's in memory: 64 MiB. Lists up to this length are
+kept from image to image; longer ones are made again, part by part."""
 
 LISTS = 4
-"""Pairs of grids whose lists are kept."""
+"""Number of pairs of grids whose lists are kept."""
 
 PIECES = 1024
-"""Texels of the larger of two cubes' face edges up to which the pieces of one on the other are kept: at most 32 MiB."""
+"""Largest face edge, in texels of the larger of two cubes, up to which the pieces of one on the other are kept: at most
+32 MiB."""
 
 TILE = 1 << 15
-"""Output texels of a cube source's general case in one launch, which takes up to a second."""
+"""Output texels in one launch of a cube source's general case, which takes up to a second."""
 
 
 @dataclass(frozen=True)
 class _Batch:
-    """Generators first … first + count - 1 of `overlap.cl`, and their lists where these are kept."""
+    """Generators first … first + count - 1 of `overlap.cl`, with their lists if these are kept."""
 
     first: int
     count: int
@@ -41,14 +42,15 @@ class _Batch:
 
 
 class Means:
-    """The means of one source; `texels` float32, (h, w, 3) a lat-long or (6, n, n, 3) a cube in the GL-direct layout.
+    """The means of one source.
 
-    `rotation`: radians that the azimuth atan2(z, x) of the source grows by. `radiance` is the same texels on the
-    device, where they are there already; neither may change while this lives.
+    texels: float32, (h, w, 3) for a lat-long or (6, n, n, 3) for a cube in the GL-direct layout. rotation: radians by
+    which the azimuth atan2(z, x) of the source grows. radiance: the same texels on the device, if they are there
+    already. Neither may change while this object exists.
 
-    Error: areas are right to 1e-11 of a texel's, sums are float64, and the level is rounded to float32 once, by half
-    an ulp. Weights add up to 1, so that a constant comes out exactly. A cube source that is turned, or read as a
-    lat-long, is clipped by polygons of great circles: 1e-5 beside a sun of 1e6, 1e-4 at the poles of a small lat-long.
+    Error: areas are right to 1e-11 of a texel's, sums are float64, and the level is rounded to float32 once, by half an
+    ulp. Weights add up to 1, so that a constant comes out exactly. A cube source that is turned, or that is read as a
+    lat-long, is clipped by polygons of great circles: 1e-5 next to a sun of 1e6, 1e-4 at the poles of a small lat-long.
     """
 
     def __init__(self, device: Device, texels: np.ndarray, rotation: float, radiance: Buffer | None = None) -> None:
@@ -80,7 +82,7 @@ class Means:
         return self._latlong(shape) if shape.latlong else self._cube_from_latlong(shape.size)
 
     def exact(self, shape: Shape, index: np.ndarray) -> np.ndarray:
-        """(m, 3) float64: the mean over chosen texels of `shape`, by flat index, on the host and in another form."""
+        """The mean over chosen texels of `shape`, by flat index, (m, 3) float64, on the host and by another method."""
         return mean_over_texels(self.texels, self.rotation, shape.latlong, shape.size, index)
 
     def _same_texels(self, shape: Shape) -> bool:

@@ -1,5 +1,4 @@
-"""Recipe and source -> the work: source grids, cuts of texels, precision and lobe evaluations that a tolerance
-needs; the sizes of launches and lists that keep memory and rounding bounded."""
+"""Plans the work of a specular chain: source grids, texel cuts, precision and launch sizes that a tolerance needs."""
 from __future__ import annotations
 
 import math
@@ -12,61 +11,66 @@ from whitefurnace.opencl.constants import BEYOND, RUN
 from whitefurnace.prefiltering.recipe import Chain
 
 BRIGHT = 64, 256, 1024, 4096
-"""Texels of largest radiance × solid angle that are clipped and summed exactly: what a sun or a lamp holds more than
-its surroundings. 16 leave up to twice the error on rough levels, 256 no less than 64 (studio, forest, sunset); a sun
-that covers hundreds of texels of a large image must go as a whole."""
+"""Numbers of brightest texels (radiance × solid angle) that may be clipped and summed exactly, so that a sun or a lamp
+is not part of the grid. 16 leave up to twice the error on rough levels, 256 no less than 64 (studio, forest, sunset). A
+sun that covers hundreds of texels of a large image must be taken as a whole."""
 
 LEFT_BRIGHT = 2e-3
-"""Of all energy, what a number of bright texels may leave, clipped, for that number to have been enough."""
+"""Largest share of all energy that the bright texels may leave when clipped, for their number to be enough."""
 
 CHUNK = 8192
-"""Sources of one partial sum: bounds float32 rounding to 7e-7 whatever the length (`prefilter.cl`)."""
+"""Number of sources in one partial sum. It bounds float32 rounding to 7e-7 whatever the length (`prefilter.cl`)."""
 
 PAIRS_A_LAUNCH = 1 << 31
-"""About 0.1 s on two cores where every pair is evaluated: Ctrl-C and progress between launches, and far below a GPU's
-watchdog."""
+"""Pairs of a launch, about 0.1 s on two cores where every pair is evaluated. Ctrl-C and progress come between launches,
+and this is far below a GPU's watchdog."""
 
 SYMMETRIC = 8
-"""How many times as many pairs the symmetric sums take in the same time."""
+"""Speed-up of the symmetric convolution over direct summation."""
 
 
 def splits_for(groups: int, classes: int) -> int:
-    """Into how many partial sums a launch of `groups` work items divides its classes, so that all cores are busy."""
+    """Number of partial sums into which a launch of `groups` work items divides its classes, so that all cores are
+    busy."""
     return max(1, min(-(-SPREAD // groups), classes // RUN))
 
 
 SPREAD = 16
-"""Work items at least, where there are sources enough: what few outputs would else leave idle."""
+"""Smallest number of work items where there are enough sources. With few outputs, cores would be idle otherwise."""
 
 NODES_A_BAND = 1 << 18
-"""Source nodes listed at a time in the exact sum: 8 MiB, which stays in cache while all lobes read it."""
+"""Source nodes listed at a time in the exact sum: 8 MiB, which stay in cache while all lobes read them."""
 
-# Nodes a face edge for a p99 error of 1e-3 on the hardest of the measured environments (studio, forest): the
-# sharp term follows the lobe's width, the floor the kink of (n·l)₊ at the horizon, which rough lobes carry to
-# full height. The error falls like n^-RATE (measured, 1e-2 to 1e-5), so other tolerances scale n by
-# (1e-3/tolerance)^(1/RATE); at the kink like n^-2.
+# Nodes a face edge for a p99 error of 1e-3 on the hardest of the measured environments (studio, forest). The sharp
+# term follows the lobe's width. The floor follows the kink of (n·l)₊ at the horizon, which rough lobes have at full
+# height. The error falls like n^-RATE (measured, 1e-2 to 1e-5), so other tolerances scale n by
+# (1e-3/tolerance)^(1/RATE); at the kink it falls like n^-2.
 SHARP, MARGIN, FLOOR, KINK = 2.1, 8, 24, 42
 RATE = 6.5
 LARGEST_GRID = 2048
 GROWTH = 1.2, 3.0
-"""How much finer at least and at most the grid of a level becomes when its certificate misses the tolerance."""
+"""Smallest and largest factor by which a level's grid is refined when its certificate misses the tolerance."""
 
 NEAR_BRIGHT = 64
-"""Further texels, those nearest the brightest sources, where an error hides from a uniform draw."""
+"""Size of the near-source sample: the texels nearest the brightest sources, where an error hides from a uniform draw.
+"""
 
 
 def precision_for(tolerance: float) -> int:
-    """Working precision: float32 leaves up to 3e-5 on dark texels, so tight tolerances take float64."""
+    """Working precision in bits for a tolerance. Float32 leaves up to 3e-5 on dark texels, so below 1e-4 it is 64."""
     return 64 if tolerance < 1e-4 else 32
 
 
 @dataclass(frozen=True)
 class LevelPlan:
-    """One level: `size` texels a face edge, its roughness, and the grid and cuts that serve it.
+    """The plan of one level.
 
-    `grid` is the number of nodes a face edge of its anterpolated source, 0 where the level is the exact mean
-    over each texel (roughness 0) or sampled. `cuts` is the number of quadrature nodes a texel edge in its exact sum.
-    `samples` is how many a texel of filtered importance sampling takes, 0 for none.
+    size        texels a face edge
+    roughness   perceptual roughness
+    parameters  parameters of the NDF
+    grid        nodes a face edge of the anterpolated source; 0 for the mean over each texel (r = 0) and for samples
+    cuts        quadrature nodes a source texel's edge in the exact sum
+    samples     importance samples a texel, 0 for none
     """
 
     size: int
@@ -78,29 +82,33 @@ class LevelPlan:
 
     @property
     def outputs(self) -> int:
+        """Number of texels of the cube."""
         return 6 * self.size**2
 
     @property
     def pairs(self) -> int:
-        """Lobe evaluations of the convolution, those it may skip included in proportion to the near cap."""
+        """Lobe evaluations of the convolution. Pairs that it may skip count in proportion to the near cap."""
         return self.outputs * self.samples or pairs_of(self.outputs, self.grid, max(self.roughness**2, 1e-5))
 
 
 def pairs_of(outputs: int, grid: int, alpha: float, horizon: float | None = None) -> int:
-    """Pairs of `outputs` directions and sources over a grid, as its parts leave them."""
+    """Pairs of `outputs` directions and the sources of a grid, over the parts into which the lobe is split."""
     return int(outputs * 6 * sum(part.grid**2 * part.share for part in parts_for(grid, alpha, horizon)) if grid else 0)
 
 
 def kink(horizon: float) -> float:
-    """What the grid follows of the kink where l sets: a rim (sheen) meets so many nodes that their errors cancel,
-    all but for hard panels, which a certificate finds."""
+    """Effective strength of the lobe's kink at the horizon, from `horizon`, the α at which GGX has the same.
+
+    The rim of a sheen lobe crosses so many nodes that their errors cancel, except under hard panels, which a
+    certificate finds; so strengths above 1 count less.
+    """
     return horizon if horizon <= 1 else horizon**0.6
 
 
 def grid_size(alpha: float, tolerance: float, horizon: float | None = None) -> int:
-    """Nodes a face edge that a lobe of roughness α needs for a p99 texel error ≤ tolerance, a multiple of 16.
+    """Nodes a face edge that a lobe of width α needs for a p99 texel error within a tolerance, a multiple of 16.
 
-    `horizon` is the α whose kink where l sets is as hard as the lobe's, α itself for GGX.
+    horizon: the α at which GGX's kink at the horizon is as strong as the lobe's; by default α itself.
     """
     finer = (1e-3 / tolerance) ** (1 / RATE)
     n = max((SHARP / max(alpha, 1e-9) + MARGIN) * finer,
@@ -109,53 +117,59 @@ def grid_size(alpha: float, tolerance: float, horizon: float | None = None) -> i
 
 
 FEWER_NODES = 0.7
-"""Nodes for a texel at most where a level is convolved at nodes: fewer, since it is then read at texels too."""
+"""Largest number of nodes for a texel where a level is convolved at nodes. It is below 1, because the level is then
+read at texels too."""
 
 TEXELS_A_LAUNCH = 1 << 20
-"""Texels read from nodes together, .05 s."""
+"""Texels that one launch reads from nodes, .05 s."""
 
 
 def output_nodes(n: int, alpha: float) -> int:
-    """Nodes an edge of the grid from which a level can be read whose lobe takes the grid n: a quarter finer than the
-    lobe needs, for a fourth of the error. The kink where l sets is no more in what it was convolved with."""
+    """Nodes an edge of the grid at which a level is convolved before it is read at texels.
+
+    n: nodes an edge of the lobe's source grid. The result is a quarter finer than the lobe needs, for a fourth of the
+    error. The convolved light has no kink at the horizon any more.
+    """
     finer = (n - 2 * BEYOND) / (SHARP / alpha + MARGIN)
     return nodes_for(1.25 * min(n - 2 * BEYOND, max(finer, 1.0) * (SHARP / alpha + FLOOR)))
 
 
 def spacing(grid: int) -> float:
-    """Radians between the nodes of a grid."""
+    """Angle between the nodes of a grid, in radians."""
     return math.pi / 2 / (grid - 2 * BEYOND)
 
 
 def nodes_for(n: float) -> int:
-    """Nodes an edge of the grid with at least n of them on a face: a multiple of 16."""
+    """Nodes an edge of the smallest grid with at least n of them on a face, a multiple of 16."""
     return max(16 * math.ceil((n + 2 * BEYOND) / 16), 32)
 
 
 SHARP_ENOUGH = 0.1
-"""Lobes up to this α carry too little near the horizon for its kink to be seen."""
+"""Largest α of a lobe that carries too little near the horizon for its kink to matter."""
 
 MOST_CUTS = 64
-"""Where the search for converged reference nodes ends: 4096 nodes a texel."""
+"""Largest number of nodes a texel edge in the search for converged reference nodes: 4096 nodes a texel."""
 
 
 CENTRE_ERROR = 1e-5
-"""Of masses at corrected texel centres, at the p99, for a texel of .34 α: measured, 3e-6 on a studio, 8e-6 on noise
+"""Error (p99) of masses at corrected texel centres, for a texel of .34 α. Measured: 3e-6 on a studio, 8e-6 on noise
 whose texels differ by factors of 20."""
 
 CENTRED = (4, 2, 1)
-"""Parts an edge into which texels may be cut for masses at corrected centres."""
+"""Numbers of parts an edge into which texels may be cut for masses at corrected centres."""
 
 
 def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0, centred: int = 1) -> int:
-    """Quadrature nodes a texel edge to begin with, so that integrating a lobe over a texel of angle `texel` errs
-    less than tolerance/10.
+    """Quadrature nodes a texel edge to begin with, so that integrating a lobe over a texel errs less than tolerance/10.
 
-    Masses at the corrected centres of c × c parts of each texel, c up to `centred` (0 where there are none), leave
-    CENTRE_ERROR (texel/α/c/.34)⁶; an uncorrected midpoint 1.3e-3·(texel/α/.34)²; pairs of Gauss points in m cells an
-    edge about 1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this bounds by its fourth power. The
-    kink of (n·l)₊ costs a texel with `share` of all energy share·texel/(8 cuts²) where it sets; what a whole
-    panel costs that sets at once no formula says: a certificate doubles the cuts until nothing changes.
+    texel: its angle in radians. alpha: the lobe's width. share: largest share of all energy that a texel holds.
+    centred: largest number of parts an edge for masses at corrected centres, 0 where there are none.
+
+    Masses at the corrected centres of c × c parts of each texel, c up to `centred`, leave CENTRE_ERROR
+    (texel/α/c/.34)⁶; an uncorrected midpoint 1.3e-3·(texel/α/.34)²; pairs of Gauss points in m cells an edge about
+    1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this bounds by its fourth power. The kink of (n·l)₊ costs a texel
+    with `share` of all energy share·texel/(8 cuts²) where it sets. No formula gives the cost of a whole panel that sets
+    at once: a certificate doubles the cuts until nothing changes.
     """
     x = texel / alpha / 0.34
     kinked = math.sqrt(2.5 * share * texel / tolerance)
@@ -169,16 +183,17 @@ def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0, c
 
 
 def cuts_error(texel: float, alpha: float, cuts: int, centred: int = 1) -> float:
-    """What `cuts` nodes an edge leave of a smooth lobe, by the laws of `cuts_for`."""
+    """Error of integrating a smooth lobe over texels with `cuts` nodes an edge, by the laws of `cuts_for`."""
     x = texel / alpha / 0.34
     return CENTRE_ERROR * (x / cuts) ** 6 if cuts <= centred else 2.6e-5 * (2 * x / cuts) ** 4
 
 
 def bright_cuts(texel: float, horizon: float, tolerance: float, shares: np.ndarray) -> np.ndarray:
-    """Nodes an edge of bright texels that hold `shares` (m,) of all energy, powers of two, (m,) integers.
+    """Nodes an edge of bright texels, powers of two, (m,) integers.
 
-    Where one sets, the kink of (n·l)₊ costs share·texel/(8 cuts²) of the mean; texels a thousand times darker
-    than the mean are held to the tolerance too, so the factor is 10³/8. Lobes with little at the `horizon` need none.
+    shares: (m,) shares of all energy that they hold. horizon: strength of the lobe's kink at the horizon; a lobe with
+    little there needs no more than 2. Where a bright texel sets, the kink of (n·l)₊ costs share·texel/(8 cuts²) of the
+    mean. Texels a thousand times darker than the mean are held to the tolerance too, so the factor is 10³/8.
     """
     if horizon <= SHARP_ENOUGH:
         return np.full(len(shares), 2)
@@ -196,8 +211,11 @@ class Window:
 
 @dataclass(frozen=True)
 class Part:
-    """A share of a lobe on a grid of `grid` nodes a face edge: what lies beyond the window `inner` and within the
-    window `outer` (None: no bound on that side). The parts of a lobe sum to it."""
+    """A part of a lobe, on a grid of `grid` nodes a face edge. The parts of a lobe add up to it.
+
+    inner  the part lies beyond this window, None for no bound
+    outer  the part lies within this window, None for no bound
+    """
 
     grid: int
     inner: Window | None
@@ -205,36 +223,39 @@ class Part:
 
     @property
     def share(self) -> float:
-        """Of the sphere, the part within reach."""
+        """Share of the sphere within reach of the part."""
         return self.outer.q1 / 4 if self.outer else 1.0
 
     @property
     def work(self) -> float:
-        """Products for each output, in those of a transformed sum over one node."""
+        """Products for each output, in units of a transformed sum over one node."""
         return self.grid**2 * (close_work(math.sqrt(self.outer.q1), self.grid) if self.outer else 1.0)
 
 
 TILE_REACH = 4.0
-"""Nodes of a grid by which its tiles and groups of outputs widen the reach of a window."""
+"""Number of grid nodes by which its tiles and groups of outputs widen the reach of a window."""
 
 
 def close_work(chord: float, n: int) -> float:
-    """Of a sum over all nodes by transforms, what one over those within a chord costs without: eight times as much a
-    node, and chord²/4 of the sphere."""
+    """Cost of a sum without transforms over the nodes within a chord, relative to a transformed sum over all nodes.
+
+    It is eight times the cost a node, over chord²/4 of the sphere. n: nodes an edge of the grid.
+    """
     return 2 * (chord + TILE_REACH * math.pi / 2 / n) ** 2
 
 
 FAR_NODES = 20.0
-"""Nodes × radians of a far grid beyond the angle where the near part ends, for 1e-3: measured to leave the error as
-it is."""
+"""Nodes × radians of a far grid beyond the angle where the near part ends, for a tolerance of 1e-3. Measured: it leaves
+the error as it is."""
 
 @lru_cache(maxsize=4096)
 def parts_for(n: int, alpha: float, horizon: float | None = None) -> tuple[Part, ...]:
-    """The parts of a lobe whose fine grid is n × n, the cheapest that were found.
+    """The cheapest partition found of a lobe whose fine grid has n × n nodes a face.
 
-    A sharp lobe needs its fine grid near r only. Near pairs grow with θ², θ the angle at which a window ends; what
-    lies beyond is smooth on the scale θ, its grid falls like 1/θ, and may be parted again. The last grid
-    must also carry the lobe's kink at the horizon. A finer n, for a tighter tolerance, refines all alike.
+    A sharp lobe needs its fine grid only near r. The number of near pairs grows with θ², where θ is the angle at which
+    a window ends. The rest of the lobe is smooth on the scale θ, so its grid shrinks like 1/θ, and it may be parted
+    again. The last grid must also resolve the lobe's kink at the horizon. A finer n, for a tighter tolerance, refines
+    all grids alike.
     """
     horizon = alpha if horizon is None else horizon
     finer = (n - 2 * BEYOND) / (SHARP / alpha + MARGIN)
@@ -268,8 +289,11 @@ def parts_for(n: int, alpha: float, horizon: float | None = None) -> tuple[Part,
 
 
 def plan_chain(chain: Chain, texel: float, share: float = 0.0, centred: int = 1) -> tuple[LevelPlan, ...]:
-    """The levels of a chain for a source whose texels subtend `texel` radians and hold at most `share` of its
-    energy each, bright ones apart."""
+    """The plans of a chain's levels.
+
+    texel: angle of the source's texels in radians. share: largest share of the source's energy that a texel holds,
+    without the bright ones. centred: as in `cuts_for`.
+    """
     levels = []
     for size, r in chain.levels:
         parameters = chain.parameters(r)
@@ -281,7 +305,7 @@ def plan_chain(chain: Chain, texel: float, share: float = 0.0, centred: int = 1)
 
 
 def refined(level: LevelPlan, missed: float, horizon: float) -> LevelPlan | None:
-    """The same level on a finer grid, or None where the finest has been tried. `missed`: its error by the tolerance."""
+    """The same level on a finer grid; None where the finest was tried. missed: the level's error over the tolerance."""
     order = RATE if horizon <= SHARP_ENOUGH else 2
     growth = min(max((1.5 * missed) ** (1 / order), GROWTH[0]), GROWTH[1]) if missed < math.inf else GROWTH[1]
     grid = min(16 * math.ceil(level.grid * growth / 16), LARGEST_GRID)

@@ -1,8 +1,8 @@
-"""What engines show of a chain: the error of reading it between texels, between levels and from a stored format.
+"""Measures the error of reading a chain as engines do: between texels, between levels and from a stored format.
 
-The levels of a bake are exact to their tolerance; what is seen of them is not. For a roughness r an engine reads at
-lod(r), bilinearly in two cube levels and linearly between them. `as_read` holds that against the exact lobe of r in
-that very direction, and says which part of the way costs what.
+The levels of a bake are exact to their tolerance, but an engine shows them with further errors. For a roughness r it
+reads at lod(r), bilinearly in two cube levels and linearly between them. `Reader.as_read` compares the result with the
+exact lobe of r in the same direction, and splits the error into parts.
 """
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from whitefurnace.sphere.environments import Environment, cube_solid_angles
 from whitefurnace.sphere.grids import Shape, cube_directions, face_coordinates, radiance_at
 
 DIRECTIONS = 256
-"""Random directions, the same for every environment. From one set of them to another the mean over r of a studio's
-error varies by 2 % (standard deviation of five), and the ratio of `--fit read` to own lobes by 1 %."""
+"""Number of random directions, the same for every environment. From one set of them to another the mean over r of a
+studio's error varies by 2 % (standard deviation of five), and the ratio of `--fit read` to own lobes by 1 %."""
 
 SCORED = 24
 SMOOTHEST = 1 / 24
@@ -36,29 +36,31 @@ texel of a 1K image and what is seen is the image; Filament clamps at .045."""
 
 REDUCED, COARSEST = 0.35, 128
 """A lobe of α is integrated over texels (halved by exact means where the image has finer ones) of at most this × α, in
-no fewer rows than that: on a studio they leave 2.4e-3 RMS at most, far below the error of any read."""
+no fewer rows than that. On a studio they leave 2.4e-3 RMS at most, far below the error of any read."""
 
 TOLERANCE = 4e-2
-"""Of the quadrature where the image's own texels are coarser than that: r < .1, where reads err ten times more."""
+"""Tolerance of the quadrature where the image's own texels are coarser than that: r < .1, where reads have ten times
+this error."""
 
 STEP = 0.1
-"""In log r, of the nodes at which lobes are integrated; between them they are interpolated, within 3e-4 RMS."""
+"""Step in log r of the nodes at which lobes are integrated. Between them they are interpolated, within 3e-4 RMS."""
 
 PARTS = ("between", "texels", "levels", "format", "all")
-"""What a read adds to the exact lobe: `between` levels that are exact everywhere, linearly in lod; `texels`, bilinearly
-between texels; `levels`, the bound on the 99th percentile of texel errors that each level states, of those that are
-read; `format`, what is stored of them; and `all` of it together."""
+"""Parts of the error that a read adds to the exact lobe: `between` levels that are exact everywhere, linearly in lod;
+`texels`, bilinearly between texels; `levels`, the stated p99 errors of the levels that are read; `format`, the error of
+the pixel format; and `all`, the total error."""
 
 
 # ------------------------------------------------------------------------------------------------- formats
 
 
 FORMATS: Mapping[str, str] = {"float32": "rgba32f", "float16": "rgba16f", "r11g11b10": "b10g11r11", "rgb9e5": "rgb9e5"}
-"""Formats that reads are measured through, and the pixel format of files that each is."""
+"""Formats through which reads are measured, each with the pixel format of files that it is."""
 
 
 def stored(values: np.ndarray, format: str) -> np.ndarray:
-    """What radiance (…, 3) reads back as from a format of FORMATS, float64. Raises UsageError with the nearest name."""
+    """Radiance (…, 3) after a round trip through a format of FORMATS, float64. Raises UsageError with the nearest name.
+    """
     if format not in FORMATS:
         raise UsageError(f"unknown format {format!r}{nearest(format, FORMATS)}")
     values = np.asarray(values, np.float64)
@@ -72,8 +74,8 @@ def stored(values: np.ndarray, format: str) -> np.ndarray:
 def taps(size: int, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices (4, m) and weights (4, m) of a seamless bilinear read of a cube of `size` in directions (3, m).
 
-    Beyond an edge stands the texel of the next face that meets it there; the one that is missing at a corner is the
-    mean of the other three [OpenGL 4.6, 8.13].
+    Beyond an edge the read takes the texel of the next face that meets it there. The texel that is missing at a corner
+    is the mean of the other three [OpenGL 4.6, 8.13].
     """
     face, s, t = face_coordinates(d)
     x, y = (s + 1) / 2 * size - 0.5, (t + 1) / 2 * size - 0.5
@@ -100,13 +102,14 @@ def taps(size: int, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bilinear(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(m, 3): a cube level (6, s, s, 3) read in directions (3, m)."""
+    """A cube level (6, s, s, 3) read bilinearly in directions d (3, m): (m, 3)."""
     index, weights = taps(texels.shape[1], d)
     return np.einsum("km,kmc->mc", weights, texels.reshape(-1, 3)[index].astype(np.float64))
 
 
 def hats(roughness: np.ndarray, recipe: Chain) -> np.ndarray:
-    """(r, levels): the weight of each level of a chain in a read at roughness r, linear in lod between two."""
+    """Weights of the levels of a chain in reads at roughness values (r,), linear in lod between two levels: (r,
+    levels)."""
     lod = np.array([recipe.lod(float(r)) for r in roughness])
     return np.maximum(1 - np.abs(lod[:, None] - np.arange(len(recipe.levels))), 0)
 
@@ -137,7 +140,7 @@ def single(roughness: float) -> Mixture:
 
 
 class Exact:
-    """Exact values of a chain's lobes in any direction, each over texels as large as it allows."""
+    """Exact values of a chain's lobes in any direction, integrated over the largest texels that each lobe allows."""
 
     def __init__(self, device: Device, env: Environment, recipe: Chain) -> None:
         self.device, self.env, self.recipe = device, env, recipe
@@ -161,15 +164,15 @@ class Exact:
         return self._lobes[mixture]
 
     def convolver(self, k: int, precision: int = 32) -> Convolver:
-        """That of the k-th source, 0 the environment itself."""
+        """The convolver of the k-th source, where 0 is the environment itself."""
         if (k, precision) not in self._convolvers:
             self._convolvers[k, precision] = Convolver(self.device, self._sources[k][1], precision=precision)
         return self._convolvers[k, precision]
 
     def lobes(self, wanted: Sequence[tuple[Mixture, np.ndarray]]) -> list[np.ndarray]:
-        """For each (mixture, directions (3, m)): the exact values, (m, 3) float64; that of roughness 0 is the radiance.
+        """Exact values of lobes in given directions, (m, 3) float64 for each (mixture, directions (3, m)).
 
-        Raises UnsupportedError for a lobe that underflows.
+        At roughness 0 the value is the radiance. Raises UnsupportedError for a lobe that underflows.
         """
         values: list[np.ndarray] = [np.empty(0)] * len(wanted)
         groups: dict[tuple[int, int], list[int]] = {}
@@ -204,18 +207,20 @@ class Exact:
         return values
 
     def radiance(self, d: np.ndarray) -> np.ndarray:
-        """(m, 3): the texel of the environment in each direction, its rotation included."""
+        """Radiance (m, 3) of the environment's texel in each direction, with its rotation."""
         return radiance_at(self.env, d)
 
     def means(self, size: int, index: np.ndarray) -> np.ndarray:
-        """(m, 3): the exact means over texels of a cube of `size`, by flat index: what level 0 stores."""
+        """Exact means (m, 3) over texels of a cube of `size`, by flat index, as level 0 stores them."""
         convolver = self.convolver(0)
         return convolver.exact_means(Shape(False, size), index) / convolver.scale
 
 
 class Interpolated:
-    """Exact values in fixed directions at any roughness of a range: by cubic interpolation of their logarithm in
-    log r, since they are positive, span decades and are smooth in r."""
+    """Exact values in fixed directions at any roughness of a range.
+
+    Their logarithm is interpolated cubically in log r, since they are positive, span decades and are smooth in r.
+    """
 
     def __init__(self, exact: Exact, d: np.ndarray, smoothest: float) -> None:
         self.exact, self.d = exact, d
@@ -228,7 +233,7 @@ class Interpolated:
         self.values = np.log(np.stack(values) + self.floor)  # (nodes, m, 3)
 
     def at(self, roughness: Sequence[float] | np.ndarray) -> np.ndarray:
-        """(r, m, 3) float64; r = 0 is the radiance of the environment."""
+        """Values (r, m, 3) float64 at roughness values; at r = 0 the radiance of the environment."""
         out = []
         for r in roughness:
             if r == 0:
@@ -247,12 +252,13 @@ class Interpolated:
 
 @dataclass(frozen=True)
 class AsRead:
-    """The error of a chain as it is read, part by part (PARTS, of which those are there that were measured).
+    """The error of a chain as it is read, split into the PARTS that were measured.
 
-    Of directions uniform over the sphere, at every r of `roughness`: `rms` and `p95`, root mean square and 95th
-    percentile over directions of the texel error (README, "What the numbers mean": the largest over channels of
-    |x - ref| / max(ref, 1e-3 · mean)), where ref is the exact lobe of r in the direction and x - ref is what the
-    part adds. The number of a part is the mean of `rms` over r, uniform from SMOOTHEST to 1.
+    sizes      face edge of each level; `fit` and `format` of the chain
+    roughness  (n,) perceptual roughness values of the reads
+    rms, p95   for each part (n,): root mean square and 95th percentile, over directions uniform on the sphere, of the
+               texel error, the maximum over channels of |x - ref| / max(ref, 1e-3 · mean); ref is the exact lobe in the
+               direction, and x - ref the change that the part makes
     """
 
     sizes: tuple[int, ...]
@@ -263,10 +269,11 @@ class AsRead:
     p95: Mapping[str, np.ndarray]
 
     def mean(self, part: str = "all") -> float:
+        """Mean of a part's RMS error over r, uniform from SMOOTHEST to 1."""
         return float(self.rms[part].mean())
 
     def data(self) -> dict[str, Any]:
-        """As manifests and JSON rows hold it."""
+        """The errors as manifests and JSON rows hold them."""
         parts = {part: {"mean": float(self.rms[part].mean()), "p95": float(self.p95[part].mean())}
                  for part in PARTS if part in self.rms}
         whole = "all" if "all" in self.rms else "between"
@@ -278,20 +285,21 @@ class AsRead:
 
 
 def scored() -> np.ndarray:
-    """(SCORED,) roughnesses at which reads are scored."""
+    """The (SCORED,) roughness values at which reads are scored."""
     return SMOOTHEST + (1 - SMOOTHEST) * (np.arange(SCORED) + 0.5) / SCORED
 
 
 def random_directions(count: int = DIRECTIONS, seed: int = 0) -> np.ndarray:
-    """(3, count), uniform over the sphere."""
+    """Directions (3, count), uniform over the sphere."""
     d = np.random.default_rng(seed).normal(size=(3, count))
     return d / np.sqrt((d * d).sum(0))
 
 
 class Reader:
-    """Measures chains (`recipes`, of one NDF) of one environment as they are read; what they share is integrated once.
+    """Measures chains of one environment as they are read; integrals that they share are computed once.
 
-    directions: how many random ones of the sphere, drawn from `seed`. Raises InputError, DeviceError.
+    recipes: chains of one NDF. directions: number of random directions, drawn from `seed`. Raises InputError,
+    DeviceError.
     """
 
     def __init__(self, device: Device, env: Environment, *recipes: Chain, directions: int = DIRECTIONS,
@@ -304,7 +312,7 @@ class Reader:
         self.reference = self.at_directions.at(scored())
 
     def mixtures(self, recipe: Chain) -> list[Mixture]:
-        """What each level holds, as weights of lobes; the mirror is ((1, 0),)."""
+        """The mixture of lobes of each level, as (weight, roughness) pairs; ((1, 0),) is the mirror."""
         own = [single(r) for _, r in recipe.levels]
         if recipe.fit != "read":
             return own
@@ -315,9 +323,10 @@ class Reader:
                 kept: Sequence[np.ndarray] | None = None, texels: bool = True) -> AsRead:
         """The error of a chain as it is read.
 
-        levels: its baked levels, (6, s, s, 3) each, and `errors` what they state; without them it is that of levels
-        exact in every texel. kept: what `format` made of the levels; without it one of FORMATS is applied. texels:
-        False leaves out what lies within a level, and costs next to nothing then.
+        levels: its baked levels, (6, s, s, 3) each, with `errors`, their stated errors; without them the levels are
+        exact in every texel. format: one of FORMATS. kept: the levels after a round trip through the format; without
+        it, the format is applied here. texels: False leaves out the error within a level, which costs almost nothing
+        then.
         """
         mixtures = self.mixtures(recipe)
         weights = hats(scored(), recipe)
@@ -363,8 +372,11 @@ class Reader:
 
 
 def alternatives(recipe: Chain) -> list[Chain]:
-    """A plan beside what could be had: own lobes and `--fit read`, with its number of levels, half as many more and
-    twice as many. More levels than the last size halves to keep that size."""
+    """The plans that a chain can be compared with: own lobes and `--fit read`, each with the chain's number of levels,
+    half as many more, and twice as many.
+
+    Where there are more levels than halvings, the last levels keep the last size.
+    """
     count = len(recipe.levels)
     found = []
     for n in dict.fromkeys((count, min(math.ceil(1.5 * count), LEVELS_RANGE[1]), min(2 * count, LEVELS_RANGE[1]))):
@@ -373,7 +385,8 @@ def alternatives(recipe: Chain) -> list[Chain]:
 
 
 def compared(device: Device, env: Environment, recipe: Chain, *, alone: bool = False) -> list[AsRead]:
-    """`alternatives` as they are read, the levels exact; `alone`: the plan only, where an engine allows no other."""
+    """The errors of `alternatives` as they are read, with exact levels. alone: measure the plan only, where an engine
+    allows no other."""
     choices = [recipe] if alone or recipe.only or recipe.levels[-1][1] > 1 else alternatives(recipe)
     reader = Reader(device, env, *choices)
     return [reader.as_read(choice, texels=len(choice.levels) == len(recipe.levels)) for choice in choices]

@@ -1,4 +1,4 @@
-"""A validated choice: which models, which integral or chain, which accuracy. No OpenCL and no files."""
+"""Validates the choice of a specular chain: its model, sizes, roughness values and accuracy."""
 from __future__ import annotations
 
 import math
@@ -25,7 +25,11 @@ DFG_SIZE = 128
 
 
 def tolerance_of(tolerance: float | None, quality: str | None) -> float:
-    """The level tolerance that `--tolerance` or `--quality` asks for; 1e-3 by default."""
+    """Tolerance of the levels that a tolerance or a quality asks for, 1e-3 where neither is given.
+
+    tolerance: in TOLERANCE_RANGE. quality: a name of QUALITIES. Raises UsageError for both at once, a name that is
+    unknown or a tolerance out of range.
+    """
     if tolerance is not None and quality is not None:
         raise UsageError("give a tolerance or a quality, not both")
     if quality is not None:
@@ -41,7 +45,11 @@ def tolerance_of(tolerance: float | None, quality: str | None) -> float:
 
 
 def samples_of(samples: int | None, tolerance: float | None, quality: str | None = None) -> int | None:
-    """The samples a texel that `--samples` asks for, None for none; they stand in the place of a tolerance."""
+    """Number of samples a texel that `--samples` asks for, None where it asks for none.
+
+    Samples replace the tolerance. Raises UsageError for samples out of SAMPLES_RANGE or together with a tolerance or a
+    quality.
+    """
     if samples is None:
         return None
     for what, value in (("tolerance", tolerance), ("quality", quality)):
@@ -66,38 +74,46 @@ def roughness_of_level(k: int, levels: int) -> float:
 
 
 def roughness_of_lod(lod: float, levels: int) -> float:
-    """Perceptual roughness that engines read at a lod in [0, levels - 1], between levels too."""
+    """Perceptual roughness that engines read at a lod in [0, levels - 1], which may lie between two levels."""
     return 0.0 if levels == 1 else 1 - math.sqrt(max(1 - lod / (levels - 1), 0.0))
 
 
 def lod_of_roughness(roughness: float, levels: int) -> float:
-    """Its inverse: lod = (levels - 1) r (2 - r)."""
+    """The lod at which engines read a perceptual roughness, the inverse of `roughness_of_lod`: (levels - 1) r (2 - r).
+    """
     return (levels - 1) * roughness * (2 - roughness)
 
 
 LOD_NAMES = ("r", "alpha", "max_lod", "width")
-"""What an engine's lod is a formula of: perceptual roughness, its square, levels - 1, and texels an edge of level 0."""
+"""Variables of an engine's lod formula: perceptual roughness, its square, levels - 1, and texels an edge of level 0."""
 
 ROUGHEST = 4.0
-"""No level is rougher: α = 16. Babylon's last mips have α = 1.4 and 3.4."""
+"""Largest perceptual roughness of a level, α = 16. Babylon's last mips have α = 1.4 and 3.4."""
 
 
 @dataclass(frozen=True)
 class Lods:
-    """The levels an engine reads: its `lod(r)`, None for the default; `follow`: levels past r = 1 hold a lobe of that
-    α, as the engine's own filter would make; otherwise they hold that of r = 1."""
+    """The mapping between the perceptual roughness of a surface and the lod that an engine reads.
+
+    lod     the engine's formula lod(r); None for the mapping of Filament and three.js
+    follow  True: levels past r = 1 have the lobe of that α, as the engine's own filter makes them; False: that of r = 1
+    """
 
     lod: Expression | None = None
     follow: bool = False
 
     def at(self, roughness: float, levels: int, width: int) -> float:
-        """The lod in [0, levels - 1] that is read for a roughness."""
+        """The lod in [0, levels - 1] that the engine reads for a perceptual roughness. width: texels an edge of level
+        0."""
         if self.lod is None or levels == 1:
             return lod_of_roughness(roughness, levels) if levels > 1 else 0.0
         return min(max(self._lod(roughness, levels, width), 0.0), levels - 1.0)
 
     def roughness(self, lod: float, levels: int, width: int) -> float:
-        """Its inverse, 0 for lod 0: engines hold the image itself there. Raises UsageError where lod(r) falls."""
+        """Perceptual roughness of a lod, the inverse of `at`; 0 for lod 0, where engines have the image itself.
+
+        Raises UsageError where lod(r) falls as r grows, or is no positive number.
+        """
         if self.lod is None or levels == 1:
             return roughness_of_lod(lod, levels)
         if lod <= 0:
@@ -126,7 +142,7 @@ class Lods:
 
 @lru_cache(maxsize=64)
 def _checked_end(lod: Expression, levels: int, width: int) -> float:
-    """lod(1). Raises UsageError for what is no number in (0, 1] or does not grow there."""
+    """The lod of r = 1. Raises UsageError for a formula that is no number in (0, 1] or does not grow there."""
     r = np.arange(1, 513) / 512
     values = np.broadcast_to(lod(r=r, alpha=r * r, max_lod=levels - 1, width=width), r.shape)
     what = f"{lod.where}: {lod.text!r} over {levels} levels of {width}²"
@@ -141,20 +157,23 @@ def _checked_end(lod: Expression, levels: int, width: int) -> float:
 
 
 CERTIFIED = 299
-"""Uniform texels of a certificate: the largest of 299 errors bounds the 99th percentile at 95 % confidence, since
-.99^299 = .0495 (order statistic)."""
+"""Default number of uniform texels of a certificate. The largest of 299 errors bounds the 99th percentile at 95 %
+confidence, since .99^299 = .0495 (order statistic)."""
 
 CERTIFY_RANGE = (CERTIFIED, 1 << 20)
 
 
 @dataclass(frozen=True)
 class Chain:
-    """A specular chain: sizes halve from `size` to `min_size`, roughness follows `lods`.
+    """A specular chain, whose sizes halve from `size` to `min_size` and whose roughness follows `lods`.
 
-    `count` levels, None for those that halving gives; sizes past `min_size` stay there. `fit` "read" bakes mixtures
-    of lobes that read best between levels (fitting.py), None each level's own lobe. `samples` is how many a texel of
-    filtered importance sampling takes, on every level r > 0 and in irradiance; None: what the tolerance needs.
-    `only` are the first and last level that are made, None for all of them; lods count those.
+    ndf       the NDF and its given parameters
+    tolerance bound on the stated error of every level
+    count     number of levels, None for as many as halving gives; sizes after `min_size` stay there
+    fit       "read" for levels fitted so that interpolated roughness values are most accurate (level_fit.py), else None
+    samples   importance samples a texel, for every level r > 0 and for irradiance; None for what the tolerance needs
+    certify   uniform texels of each certificate, 0 for none
+    only      first and last level that are made, None for all of them; lods count these
     """
 
     ndf: Chosen
@@ -170,7 +189,7 @@ class Chain:
 
     @cached_property
     def all_levels(self) -> tuple[tuple[int, float], ...]:
-        """(size, perceptual roughness) of each level, those that are not made too."""
+        """(size, perceptual roughness) of every level, also of those that are not made."""
         n = self.count or int(math.log2(self.size // self.min_size)) + 1
         return tuple((max(self.size >> k, self.min_size), self.lods.roughness(k, n, self.size)) for k in range(n))
 
@@ -181,16 +200,16 @@ class Chain:
 
     @property
     def first(self) -> int:
-        """The number of the first level that is made."""
+        """Number of the first level that is made."""
         return self.only[0] if self.only else 0
 
     def lod(self, roughness: float) -> float:
-        """The lod that is read for a roughness."""
+        """The lod, among the levels that are made, at which the engine reads a perceptual roughness."""
         lod = self.lods.at(roughness, len(self.all_levels), self.size)
         return lod if self.only is None else min(max(lod - self.first, 0.0), len(self.levels) - 1.0)
 
     def parameters(self, roughness: float) -> dict[str, float]:
-        """The NDF's parameters at a perceptual roughness."""
+        """Parameters of the NDF at a perceptual roughness."""
         entry = self.ndf.model
         assert entry.from_roughness is not None
         given = {name: value for name, value in self.ndf.given.items() if not isinstance(value, tuple)}
@@ -200,6 +219,7 @@ class Chain:
         return {**defaults, **entry.from_roughness(min(roughness, 1.0)), **given}
 
     def canonical(self) -> dict[str, Any]:
+        """The chain as a JSON object, equal for equal chains, as recipes and keys contain it."""
         return {"ndf": self.ndf.canonical(), "size": self.size, "min_size": self.min_size,
                 **({"tolerance": self.tolerance} if self.samples is None else {"samples": self.samples}),
                 "roughness": [r for _, r in self.levels], "fit": self.fit, "certify": self.certify,
@@ -207,7 +227,7 @@ class Chain:
 
 
 def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = MIN_SIZE) -> int:
-    """Face edge of the last level: as given, what `levels` halvings leave, or the usual one. Raises UsageError."""
+    """Face edge of the last level: as given, or what `levels` halvings leave, or the usual one. Raises UsageError."""
     if levels is None:
         return usual if min_size is None else min_size
     low, high = LEVELS_RANGE
@@ -231,12 +251,16 @@ def chain(*, ndf: Spec = "ggx", size: int = 256, min_size: int | None = None, to
           usual_min: int = MIN_SIZE, only_levels: str | None = None) -> Chain:
     """A validated specular chain.
 
-    lods: the mapping of an engine, Filament's and three.js's without; `usual_min`: the last size where none is given.
-    `min_size` is 16, or with `levels` what as many halvings leave; with both, sizes halve to `min_size` and stay.
-    only_levels: "A-B", those that are made.
-    Raises UsageError for a size that is no power of two, a `min_size` over `size`, levels that do not fit, a bad
-    tolerance or name, samples out of range or beside one of these; UnsupportedError for an NDF that cannot be
-    prefiltered (anisotropic, or without a roughness).
+    ndf: name, entry or path of an isotropic NDF. size, min_size: face edges of the first and last level in texels,
+    powers of two. levels: their number; without `min_size` each level halves, with it sizes halve to `min_size` and
+    stay. tolerance, quality, samples: accuracy, at most one of them; 1e-3 without. fit: "read" or None. certify:
+    uniform texels of each certificate, 0 for none. lods: the mapping of an engine, by default Filament's and
+    three.js's. usual_min: last size where neither `min_size` nor `levels` is given. only_levels: "A-B", the levels that
+    are made.
+
+    Raises UsageError for a size that is not a power of two, a `min_size` larger than `size`, levels that do not fit, a
+    bad tolerance or name, and samples out of range or together with a tolerance; UnsupportedError for an NDF that
+    cannot be prefiltered because it is anisotropic or has no roughness.
     """
     choice = chosen("ndf", ndf)
     if not choice.model.isotropic:

@@ -1,4 +1,5 @@
-"""One environment on a device: its brightest texels set apart, the rest as lists of nodes and as anterpolated grids."""
+"""Represents one environment on a device: its brightest texels apart, the rest as lists of nodes and as anterpolated
+grids."""
 from __future__ import annotations
 
 import math
@@ -28,19 +29,19 @@ LIGHT = frozenset({"nodes", "chosen_nodes", "gather", "coarsen", "grid_list"})
 
 
 PATCHES = 1 << 23
-"""Numbers of the blocks' sums in memory together, in an anterpolation of several faces at once."""
+"""Largest number of the blocks' sums in memory together, in an anterpolation of several faces at once."""
 
 
 CENTRED_NODES = 1 << 24
-"""Masses at corrected centres at most, two buffers of 200 MB, of texels in several parts."""
+"""Largest number of masses at corrected centres, for texels in several parts: two buffers of 200 MB."""
 
 
 class Texels:
     """The texels of one environment as kernels read them.
 
-    Radiance is scaled by a power of two to a mean near 1, which is exact and keeps sums of very bright or very
-    dark images inside float32; results are scaled back. Lobes integrate what lies above the least radiance of
-    each channel (`base`), which is added after: its share needs no sum, and a constant image comes out exactly.
+    Radiance is scaled by a power of two to a mean near 1. This is exact, and keeps sums of very bright or very dark
+    images inside float32; results are scaled back. Lobes integrate the radiance above the smallest value of each
+    channel (`base`), which is added afterwards: its share needs no sum, and a constant image comes out exactly.
     """
 
     def __init__(self, device: Device, environment: Environment, precision: int) -> None:
@@ -72,11 +73,11 @@ class Texels:
         self.cuts = 1
 
     def _extract(self) -> None:
-        """Clips BRIGHT texels of largest radiance × solid angle to the least of them.
+        """Clips BRIGHT texels of largest radiance × solid angle to the smallest of them.
 
         A sun then leaves neither a firefly nor a hole, since its excess is summed exactly for each output. A small
-        image has few bright texels: their nodes, many a texel, would cost more than the grid. `share` is what the
-        largest texel left holds of all energy, `brightest` the indices of some of the largest of all.
+        image has few bright texels, because many nodes for each of them would cost more than the grid. `share` is the
+        largest share of all energy that a texel still holds; `brightest` are the indices of some of the largest of all.
         """
         omega = source_solid_angles(self.environment).astype(np.float32)
         clipped = self.device.aligned_empty((self.values.size // 3, 3), np.float32)
@@ -107,8 +108,8 @@ class Texels:
 
     @property
     def centred(self) -> int:
-        """Into how many parts an edge texels may be cut for masses at corrected centres, 0 where the image has no
-        room for the stencil."""
+        """Largest number of parts an edge into which texels may be cut for masses at corrected centres; 0 where the
+        image is too small for the stencil."""
         if self.rows < 16 or self.columns < 16 or (self.latlong and self.columns % 2):
             return 0
         return next(c for c in planning.CENTRED if c == 1 or self.nodes(c) <= CENTRED_NODES)
@@ -144,7 +145,11 @@ class Texels:
         return self._corrected[cuts]
 
     def arguments(self, cuts: int, whole: bool = True) -> tuple[Any, ...]:
-        """What texel kernels read; `whole`: of all texels together, so that masses may be corrected by neighbours'."""
+        """Arguments of the kernels that read texels.
+
+        cuts: nodes an edge of each texel. whole: True if the kernel reads all texels together, so that masses may be
+        corrected by their neighbours'.
+        """
         centred = whole and cuts <= self.centred and cuts in planning.CENTRED
         rows, columns = self._table(cuts, centred)
         size = (self.rows * cuts, self.columns * cuts, 1) if centred else (self.rows, self.columns, cuts)
@@ -167,7 +172,7 @@ class Texels:
         return self.faces * self.rows * self.columns * cuts * cuts
 
     def bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
-        """Every node of the clipped source, in bands of whole rows: (list, nodes in it, share done)."""
+        """Every node of the clipped source, in bands of whole rows: (list, number of nodes in it, share done)."""
         width, rows = self.columns * cuts, self.faces * self.rows * cuts
         band = min(max(planning.NODES_A_BAND // width, 1), rows)
         listed = self.device.empty((band * width, 8), self.kind)
@@ -177,8 +182,10 @@ class Texels:
             yield listed, count, min(first + band, rows) / rows
 
     def bright_list(self, lobe: Lobe, tolerance: float, finer: int = 1) -> Buffer | None:
-        """The excess of the bright texels as one list: the more of the energy one holds, the more nodes it takes
-        (`finer` times as many an edge). None where nothing was clipped."""
+        """The excess of the bright texels as one list of nodes, None where nothing was clipped.
+
+        A texel gets more nodes the more energy it holds. finer: factor on the nodes an edge.
+        """
         if not len(self._index):
             return None
         smooth = planning.cuts_for(self.texel, min(lobe.alpha, planning.SHARP_ENOUGH), tolerance, centred=0)
@@ -202,14 +209,14 @@ class Texels:
     # ------------------------------------------------------------------------------------------- grids
 
     def prepare(self, n: int, cuts: int) -> None:
-        """Says which grid is the finest that a set of levels needs and how finely texels are cut for it, so that
-        none is made from the texels twice."""
+        """Announces the finest grid (n nodes an edge) that a set of levels needs and the texel cuts for it, so that no
+        grid is made from the texels twice."""
         self.cuts = max(self.cuts, cuts)
         self._finest(n)
 
     @property
     def fineness(self) -> tuple[int, int]:
-        """Nodes a face edge of the finest grid there is, 0 for none, and the cuts it was made with."""
+        """(nodes a face edge of the finest grid so far, the cuts it was made with), 0 for no grid."""
         return self._fine[:2] if self._fine else (0, 0)
 
     def _finest(self, n: int) -> tuple[int, int, Buffer]:
@@ -231,7 +238,8 @@ class Texels:
         return self._fine
 
     def grid(self, n: int) -> Buffer:
-        """(6, n, n, 4): ∫ (L, 1) φ_a dω of the nodes of an n × n grid, the bright texels clipped."""
+        """The n × n grid of each face, (6, n, n, 4): ∫ (L, 1) φ_a dω of its nodes, without the excess of the bright
+        texels."""
         fine, _, grid = self._finest(n)
         if n not in self._grids:
             matrix, first, last = (self.device.array(a) for a in coarsening(fine, n, self.kind.char))
@@ -261,7 +269,7 @@ def _largest(values: np.ndarray, count: int) -> np.ndarray:
 
 
 def _enough(values: np.ndarray, index: np.ndarray, total: float) -> np.ndarray:
-    """Of the largest values the first that hold what stands out: see BRIGHT."""
+    """The first of the largest values that hold the energy which stands out; see BRIGHT."""
     for count in planning.BRIGHT:
         if count <= len(index) and count * float(values[index[count - 1]]) <= planning.LEFT_BRIGHT * total:
             return index[:count]

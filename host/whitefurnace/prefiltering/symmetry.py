@@ -1,4 +1,4 @@
-"""Convolution by the symmetries of the cube: the orbits of grids and of levels, and the launches of `octahedral.cl`."""
+"""Convolves by the symmetries of the cube: the orbits of grids and levels, and the launches of `octahedral.cl`."""
 from __future__ import annotations
 
 import math
@@ -17,7 +17,7 @@ from whitefurnace.prefiltering.plan import Part, Window
 from whitefurnace.sphere.grids import Shape, bounds, cube_directions, grid_tangents
 
 PIECE = 1 << 16
-"""Classes of which all images are in memory together: 38 MiB in float32."""
+"""Number of classes whose images are in memory together: 38 MiB in float32."""
 
 MOST_PLACES = 512
 """Nodes an edge of the finest grid whose places are kept, in 38 MiB."""
@@ -25,10 +25,11 @@ MOST_PLACES = 512
 
 @dataclass(frozen=True)
 class Orbits:
-    """Outputs of a level, one of every orbit of its symmetries: `count` from `first` on, padded to `padded` lanes.
+    """Outputs of a level, one of every orbit of its symmetries.
 
-    number: (padded, 2) int32 and direction: (3, padded) float64, as `octahedral.cl` reads them; `exchanges` of axes
-    carry the level into itself.
+    first, count  the range of outputs; `padded`: their number with padding to whole lanes
+    exchanges     number of exchanges of axes that map the level onto itself
+    number        (padded, 2) int32, `direction` (3, padded) float64, as `octahedral.cl` reads them
     """
 
     shape: Shape
@@ -42,7 +43,8 @@ class Orbits:
 
 @lru_cache(maxsize=64)
 def orbits(shape: Shape, lanes: int, most: int) -> tuple[Orbits, ...]:
-    """The orbits of a level, neighbours side by side, at most `most` at a time, padded to multiples of `lanes`."""
+    """The orbits of a level with neighbours next to each other, in parts of at most `most`, padded to multiples of
+    `lanes`."""
     if shape.latlong:
         rows, columns = shape.dims
         i, j = np.mgrid[:rows // 2, :-(-columns // 8)].reshape(2, -1)
@@ -68,8 +70,7 @@ def orbits(shape: Shape, lanes: int, most: int) -> tuple[Orbits, ...]:
 
 
 class Classes:
-    """The classes of one grid on a device: `node` (classes, 4), direction and symmetric weight; `moment` (8, classes, 3
-    exchanges), the transforms of each one's images over the reflections, made when first asked for."""
+    """The classes of one grid on a device. Its arrays are made when they are first used."""
 
     def __init__(self, symmetries: Octahedral, n: int, grid: Buffer, exchanges: int) -> None:
         self.symmetries, self.n, self.grid, self.exchanges = symmetries, n, grid, exchanges
@@ -82,20 +83,20 @@ class Classes:
 
     @cached_property
     def node(self) -> Buffer:
-        """(classes, 4)."""
+        """Direction and symmetric weight of each class, (classes, 4)."""
         node = self.symmetries.device.empty((self.count, 4), self.symmetries.kind)
         self._launch("class_nodes", self.count, node, self.symmetries.tangents(self.n))
         return node
 
     @cached_property
     def moment(self) -> Buffer:
-        """(8, classes, 3 exchanges)."""
+        """Transforms of each class's images over the reflections, (8, classes, 3 exchanges)."""
         moment = self.symmetries.device.empty((8, self.count, 3 * self.exchanges), self.symmetries.kind)
         self._launch("class_moments", self.count, moment)
         return moment
 
     def images(self) -> Iterator[tuple[int, Buffer]]:
-        """(first class, (exchanges, count, 24) images) in pieces of at most PIECE classes; a single piece is kept."""
+        """(first class, images (exchanges, count, 24)) in pieces of at most PIECE classes; a single piece is kept."""
         if self._images is not None:
             yield 0, self._images
             return
@@ -128,7 +129,7 @@ def tile_bounds(n: int) -> np.ndarray:
 
 
 class Octahedral:
-    """The launches on one device in one precision; holds what depends on neither environment nor lobe."""
+    """The launches on one device in one precision, with the data that depend on neither environment nor lobe."""
 
     def __init__(self, device: Device, precision: int) -> None:
         self.device = device
@@ -196,8 +197,10 @@ class Octahedral:
 
     def convolve(self, partial: Buffer, first: int, splits: int, found: Orbits, lobe: Lobe, part: Part,
                  classes: Classes, error: float) -> None:
-        """Partial sums of one part in splits [first, first + splits). `error`: what the lobe's series may misplace
-        of its energy."""
+        """Writes the partial sums of one part of a lobe into splits first … first + splits - 1 of `partial`.
+
+        error: the share of its energy that the lobe's series may misplace.
+        """
         items = -(-found.padded // self.lanes // self.groups // self.device.local_size) * self.device.local_size
         series = self._series(lobe, part.inner, part.outer, error)
 
@@ -218,7 +221,7 @@ class Octahedral:
                                 self.kind.type(part.outer.q1), *series))
 
     def apart(self, found: Orbits, lobe: Lobe, listed: Buffer) -> Buffer:
-        """Sums over a list of single sources, for every output, by the NDFs themselves."""
+        """Sums over a list of single sources for every output, by the NDFs themselves."""
         real, partial = self.kind.type, self.empty(1, found)
         for k, (entry, numbers, weight) in enumerate(lobe.summands or ((None, (), 1.0),)):
             program = self.device.build(source.apart(entry).text, {
@@ -230,8 +233,11 @@ class Octahedral:
 
     def unfold(self, level: Buffer, found: Orbits, whole: Buffer | None, close: Buffer | None, apart: Buffer | None,
                per_norm: float, base: np.ndarray) -> None:
-        """Writes the texels of these orbits into `level`, (dims, 3 or 4) float32: the partial sums of both kinds of
-        parts over their weights, those `apart` times per_norm, and the base. Without `whole` they are added to it."""
+        """Writes the texels of these orbits into `level`, (dims, 3 or 4) float32.
+
+        The value is the partial sums of both kinds of parts over their weights, plus `apart` times per_norm, plus the
+        base. Without `whole` the sums are added to the level.
+        """
         real, shape = self.kind.type, found.shape
         number = self._kept(("number", shape, found.first, found.padded), found.number)
         sums = (x for some in (whole, close, apart) for x in (some, np.int32(some.shape[0] if some else 0)))
@@ -243,5 +249,5 @@ class Octahedral:
 
 @cache
 def octahedral_of(device: Device, precision: int) -> Octahedral:
-    """The one of a device and a precision."""
+    """The shared `Octahedral` of a device and a precision."""
     return Octahedral(device, precision)
