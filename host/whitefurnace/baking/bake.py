@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from whitefurnace.baking.outputs import Made, Target, targets
+from whitefurnace.baking.outputs import Encoded, Made, Target, encoded, targets
 from whitefurnace.baking.programs import Program, programs
 from whitefurnace.baking.request import BakeRequest
 from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
@@ -280,7 +280,7 @@ class Computed:
     table: Integrated
     splits: tuple[SplitSum | None, ...]
     window: harmonic.Windowed
-    written: list[Target] | None
+    written: list[Encoded] | None
     as_read: list[dict[str, Any]]
 
 
@@ -418,9 +418,9 @@ def compute(loaded: Loaded, device: Device | str | None = None,
     request, name = loaded.request, loaded.request.names[loaded.k]
     with system_errors(request.output):
         on = loaded.on or (device if isinstance(device, Device) else choose_device(device))
-        tell = (lambda what, share: progress(name, what, share)) if progress else None
+        report = (lambda part, share: progress(name, part, share)) if progress else None
         wants, of = _wanted(request)
-        lit = light(on, loaded.env, wants, seed=loaded.key, progress=tell)
+        lit = light(on, loaded.env, wants, seed=loaded.key, progress=report)
         ndf = EntryKey.of(request.recipe.ndf)
         table = _table(on, ndf)
         splits = tuple(_split(on, ndf, engine) if engine.holding("dfg") else None for engine in request.engines)
@@ -432,17 +432,17 @@ def compute(loaded: Loaded, device: Device | str | None = None,
         return replace(made, written=written, as_read=_as_read(request, on, loaded.env, lit, of, written))
 
 
-def _encoded(made: Computed) -> list[Target]:
-    """The files of every engine with what writes them."""
+def _encoded(made: Computed) -> list[Encoded]:
+    """The files of every engine, ready to be written."""
     loaded, request = made.loaded, made.loaded.request
     provenance = {"version": VERSION, "key": loaded.key, "source": loaded.env.digest,
                   "recipe": json.dumps(loaded.recipe, sort_keys=True)}
-    written = []
+    written: list[Encoded] = []
     for e, engine in enumerate(request.engines):
         own, sheen = made.of[e]
         parts = Made(made.lit, made.lit.chains[own], made.lit.chains[sheen] if engine.holding("sheen") else None,
                      made.table, made.splits[e], made.window, provenance)
-        written += targets(engine, request.chains[e], request.output, request.names[loaded.k], parts)
+        written += encoded(engine, request.chains[e], request.output, request.names[loaded.k], parts)
     return written
 
 
@@ -469,10 +469,9 @@ def _write(made: Computed) -> Baked:
     with Transaction() as transaction:
         digests = {}
         for target in written:
-            assert target.write is not None
             target.write(transaction)
             digests[target.path.relative_to(request.output).as_posix()] = {
-                **target.told, "sha256": digest_file(transaction.staged(target.path)),
+                **target.stated, "sha256": digest_file(transaction.staged(target.path)),
                 "bytes": transaction.staged(target.path).stat().st_size}
         manifest["files"] = digests
         stale, manifest["kept"] = loaded.output.superseded(loaded.there, digests)
@@ -573,7 +572,7 @@ def planned_levels(request: BakePlan, texel: float) -> tuple[tuple[tuple[str, ..
 
 
 def _as_read(request: BakePlan, on: Device, env: Environment, lit: Lighting, of: Sequence[tuple[int, int]],
-             written: Sequence[Target]) -> list[dict[str, Any]]:
+             written: Sequence[Encoded]) -> list[dict[str, Any]]:
     """What each engine shows of its chain, in its mapping and from its format."""
     rows: list[dict[str, Any]] = []
     read = [e for e, engine in enumerate(request.engines) if engine.cubes("specular")]
@@ -585,7 +584,7 @@ def _as_read(request: BakePlan, on: Device, env: Environment, lit: Lighting, of:
         target = next((t for t in written if t.engine == engine.name and len(t.levels) == len(levels)), None)
         found = reader.as_read(request.chains[e], [level.texels for level in levels], [level.error for level in levels],
                                kept=target.levels if target else None,
-                               format=str(target.told.get("format", "float32")) if target else "float32")
+                               format=str(target.stated.get("format", "float32")) if target else "float32")
         rows.append({"for": engine.name, **found.data()})
     return rows
 

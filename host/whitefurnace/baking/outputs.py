@@ -47,21 +47,37 @@ from whitefurnace.version import VERSION
 
 @dataclass(frozen=True)
 class Target:
-    """One file of a bake: its path, what writes it there, and what the manifest says of it."""
+    """One file that a bake writes.
+
+    path: where it is written. engine: name of the engine that loads it. nbytes: bytes of its arrays before compression.
+    """
 
     path: Path
     engine: str
     nbytes: int
-    """Bytes of its arrays, before any compression."""
-    write: Callable[[Transaction], object] | None = None
-    told: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Encoded(Target):
+    """A file of a bake, ready to be written.
+
+    write: stages the file in a transaction. stated: what the manifest says of it.
+    levels: of a specular chain, what a GPU reads of each level, (6, s, s, 3) in this project's directions.
+    """
+
+    write: Callable[[Transaction], object]
+    stated: Mapping[str, Any] = field(default_factory=dict)
     levels: tuple[np.ndarray, ...] = ()
-    """Of a specular chain, what a GPU reads of each level, in this project's directions."""
 
 
 @dataclass(frozen=True)
 class Made:
-    """What a bake made for one engine: its chain (and Charlie's), the light they share, its tables, who it is."""
+    """What a bake made for one engine.
+
+    chain, sheen: its specular chain, and Charlie's where it has sheen. table: the (scale, bias) table of `raw` and
+    `exr`. split: the engine's own table, where it has one. window: the windowed harmonics. provenance: version, key,
+    source and recipe, as texts.
+    """
 
     lit: Lighting
     chain: Filtered
@@ -72,37 +88,74 @@ class Made:
     provenance: Mapping[str, str]
 
 
-def targets(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made | None = None) -> list[Target]:
-    """The files of an engine under `folder`/ENGINE; with the results at hand, also what writes them."""
+@dataclass(frozen=True)
+class Writer:
+    """How the files that hold one thing are made.
+
+    planned_size: bytes of the file's arrays, before anything is computed. Raises UsageError for what cannot be made.
+    encode: the file at a path, from what the bake made.
+    """
+
+    planned_size: Callable[[Engine, Chain, File], int]
+    encode: Callable[[Engine, Path, File, Made], Encoded]
+
+
+@dataclass(frozen=True)
+class Container:
+    """How everything that a bake makes is written for `raw` or `exr`; as `Writer`, for all files at once."""
+
+    planned: Callable[[Engine, Chain, Path, str], list[Target]]
+    encode: Callable[[Engine, Chain, Path, str, Made], list[Encoded]]
+
+
+def targets(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Target]:
+    """The files of an engine under `folder`/ENGINE, planned. Raises UsageError for what cannot be made."""
     if engine.container != "files":
-        return CONTAINERS[engine.container](engine, chain, folder, stem, made)
-    found = [_WRITERS[file.holds](engine, chain, folder / engine.name / file.name.replace("{stem}", stem), file, made)
-             for file in engine.file]
-    if engine.holding("specular"):
-        for language in LANGUAGES:
-            text = snippet(engine, language, levels=len(chain.levels), width=chain.size, stem=stem).encode()
-            found.append(_bytes(engine, folder / engine.name / f"{stem}.{language}", text, {"holds": "shader snippet"}))
-    return found
+        return CONTAINERS[engine.container].planned(engine, chain, folder, stem)
+    found = [Target(_path(engine, folder, stem, file), engine.name,
+                    WRITERS[file.holds].planned_size(engine, chain, file)) for file in engine.file]
+    return [*found, *_snippets(engine, chain, folder, stem)]
 
 
-def _bytes(engine: Engine, path: Path, data: bytes, told: Mapping[str, Any]) -> Target:
-    return Target(path, engine.name, len(data),
-                  lambda t: write_atomic(path, lambda temporary: temporary.write_bytes(data), t), told)
+def encoded(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made) -> list[Encoded]:
+    """The files that `targets` plans, encoded from what a bake made."""
+    if engine.container != "files":
+        return CONTAINERS[engine.container].encode(engine, chain, folder, stem, made)
+    found = [WRITERS[file.holds].encode(engine, _path(engine, folder, stem, file), file, made) for file in engine.file]
+    return [*found, *_snippets(engine, chain, folder, stem)]
+
+
+def _path(engine: Engine, folder: Path, stem: str, file: File) -> Path:
+    return folder / engine.name / file.name.replace("{stem}", stem)
+
+
+def _snippets(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Encoded]:
+    if not engine.holding("specular"):
+        return []
+    return [_bytes(engine, folder / engine.name / f"{stem}.{language}",
+                   snippet(engine, language, levels=len(chain.levels), width=chain.size, stem=stem).encode(),
+                   {"holds": "shader snippet"}) for language in LANGUAGES]
+
+
+def _bytes(engine: Engine, path: Path, data: bytes, stated: Mapping[str, Any]) -> Encoded:
+    return Encoded(path, engine.name, len(data),
+                   lambda t: write_atomic(path, lambda temporary: temporary.write_bytes(data), t), stated)
 
 
 # ---------------------------------------------------------------------------------------------- what formats cost
 
 
-def _stored(kept: np.ndarray, true: np.ndarray, mean: float) -> dict[str, float]:
-    """What a format adds to a level: p99 and largest of its texel errors."""
+def _format_loss(kept: np.ndarray, true: np.ndarray, mean: float) -> dict[str, float]:
+    """The error that a pixel format adds to a level: p99 and largest of its texel errors."""
     off = texel_errors(kept.reshape(-1, 3).astype(np.float64), true.reshape(-1, 3).astype(np.float64), mean)
     return {"format_p99": float(np.quantile(off, 0.99)), "format_worst": float(off.max())}
 
 
-def _level_told(level: Level, kept: np.ndarray, true: np.ndarray) -> dict[str, Any]:
+def _level_stated(level: Level, kept: np.ndarray, true: np.ndarray) -> dict[str, Any]:
+    """What the manifest says of a level: `true` as computed, `kept` as the format holds it."""
     mean = float(true.astype(np.float64).mean())
     return {"size": int(true.shape[-2]), "roughness": level.roughness, "error": level.error,
-            **_stored(kept[..., :3], true, mean)}
+            **_format_loss(kept[..., :3], true, mean)}
 
 
 def _clipped(clipped: Sequence[int]) -> dict[str, Any]:
@@ -110,7 +163,7 @@ def _clipped(clipped: Sequence[int]) -> dict[str, Any]:
 
 
 def _keys(engine: Engine, made: Made, errors: Sequence[float]) -> dict[str, bytes]:
-    """What a container tells of itself; the manifest tells the rest."""
+    """The metadata of a container; the manifest states the rest."""
     return {"KTXwriter": text_value(f"whitefurnace {VERSION}"), "whitefurnace:engine": text_value(engine.name),
             "whitefurnace:key": text_value(made.provenance["key"]),
             "whitefurnace:error": text_value(" ".join(f"{e:.2e}" for e in errors))}
@@ -120,7 +173,7 @@ def _keys(engine: Engine, made: Made, errors: Sequence[float]) -> dict[str, byte
 
 
 def _texture(engine: Engine, path: Path, file: File, levels: Sequence[Level], made: Made,
-             keys: Mapping[str, bytes], coverage: Sequence[Level] = ()) -> Target:
+             keys: Mapping[str, bytes], coverage: Sequence[Level] = ()) -> Encoded:
     """Cube levels in a pixel format, turned to the engine's axes, with what the format costs each."""
     turned = [turned_cube(level.texels, engine.matrix) for level in levels]
     held: list[np.ndarray] = turned
@@ -129,14 +182,14 @@ def _texture(engine: Engine, path: Path, file: File, levels: Sequence[Level], ma
                 for texels, alpha in zip(turned, coverage, strict=True)]
     if path.suffix == ".dds":
         keys = {}  # has no place for them
-    encoded = encode(file.stored, held, cube=True, key_values=keys)
-    back = [decode(encoded.texture, k) for k in range(len(levels))]
-    told = {"holds": file.holds, "format": file.stored, **_clipped(encoded.clipped),
-            "levels": [_level_told(*one) for one in zip(levels, back, turned, strict=True)]}
+    packed = encode(file.stored, held, cube=True, key_values=keys)
+    back = [decode(packed.texture, k) for k in range(len(levels))]
+    stated = {"holds": file.holds, "format": file.stored, **_clipped(packed.clipped),
+              "levels": [_level_stated(*one) for one in zip(levels, back, turned, strict=True)]}
     inverse = np.array(engine.matrix).T
-    return Target(path, engine.name, _size(encoded.texture),
-                  lambda t: write_texture(path, encoded.texture, zstd=file.zstd, into=t), told,
-                  tuple(turned_cube(texels[..., :3], inverse) for texels in back))
+    return Encoded(path, engine.name, _size(packed.texture),
+                   lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t), stated,
+                   tuple(turned_cube(texels[..., :3], inverse) for texels in back))
 
 
 def _size(texture: Texture) -> int:
@@ -155,13 +208,17 @@ def _cube_bytes(sizes: Sequence[int], file: File) -> int:
     return 6 * sum(_square_bytes(size, file) for size in sizes)
 
 
-def _specular(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
+def _specular_size(engine: Engine, chain: Chain, file: File) -> int:
     sizes = [s for s, _ in chain.levels]
-    if made is None:
-        if file.layout == "octahedral" and file.border > sizes[-1]:
-            raise UsageError(f"{engine.name}: a border of {file.border} texels does not go around the last level's "
-                             f"{sizes[-1]}²; give a lower border or a larger --min-size")
-        return Target(path, engine.name, _cube_bytes(sizes, file) // (6 if file.layout == "octahedral" else 1))
+    if file.layout == "cube":
+        return _cube_bytes(sizes, file)
+    if file.border > sizes[-1]:
+        raise UsageError(f"{engine.name}: a border of {file.border} texels does not go around the last level's "
+                         f"{sizes[-1]}²; give a lower border or a larger --min-size")
+    return _cube_bytes(sizes, file) // 6
+
+
+def _specular(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     if file.layout == "octahedral":
         return _octahedral(engine, path, file, made)
     levels, coverage = made.chain.levels, made.chain.coverage
@@ -176,49 +233,59 @@ def _specular(engine: Engine, chain: Chain, path: Path, file: File, made: Made |
     return _texture(engine, path, file, levels, made, keys, coverage)
 
 
-def _sheen(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
-    if made is None:
-        return Target(path, engine.name, _cube_bytes([s for s, _ in chain.levels], file))
+def _sheen_size(engine: Engine, chain: Chain, file: File) -> int:
+    return _cube_bytes([s for s, _ in chain.levels], file)
+
+
+def _sheen(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     assert made.sheen is not None
     keys = _keys(engine, made, [level.error for level in made.sheen.levels])
     return _texture(engine, path, file, made.sheen.levels, made, keys, made.sheen.coverage)
 
 
-def _skybox(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
-    if made is None:
-        return Target(path, engine.name, _cube_bytes([chain.size], file))
+def _skybox_size(engine: Engine, chain: Chain, file: File) -> int:
+    return _cube_bytes([chain.size], file)
+
+
+def _skybox(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     level = made.chain.levels[0]
     return _texture(engine, path, file, [level], made, _keys(engine, made, [level.error]), made.chain.coverage[:1])
 
 
-def _irradiance(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
-    if made is None:
-        return Target(path, engine.name, _cube_bytes([IRRADIANCE_SIZE], file))
+def _irradiance_size(engine: Engine, chain: Chain, file: File) -> int:
+    return _cube_bytes([IRRADIANCE_SIZE], file)
+
+
+def _irradiance(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     level = made.lit.irradiance
     return _texture(engine, path, file, [level], made, _keys(engine, made, [level.error]))
 
 
-def _octahedral(engine: Engine, path: Path, file: File, made: Made) -> Target:
-    """Octahedral maps: mips of a texture, or one image of bordered levels, whose places the manifest tells."""
+def _octahedral(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
+    """Octahedral maps: mips of a texture, or one image of bordered levels, whose places the manifest states."""
     levels, coverage = made.chain.octahedral, made.chain.octahedral_coverage
     maps = [level.texels for level in levels]
-    told: dict[str, Any] = {"holds": file.holds, "format": file.stored, "layout": "octahedral", "border": file.border}
+    stated: dict[str, Any] = {"holds": file.holds, "format": file.stored, "layout": "octahedral", "border": file.border}
     if coverage and file.stored in ("rgba16f", "rgba32f", "float32"):
         maps = [np.concatenate([texels, alpha.texels[..., :1]], -1)
                 for texels, alpha in zip(maps, coverage, strict=True)]
     if file.suffix == ".exr":
         image, places = to_atlas(maps, file.border)
-        told["levels"] = [{"size": p.side, "roughness": level.roughness, "error": level.error, "row": p.row,
-                           "column": p.column} for level, p in zip(levels, places, strict=True)]
-        texts = {f"whitefurnace:{name}": value for name, value in made.provenance.items()}
-        return Target(path, engine.name, image.nbytes, lambda t: write_exr(
-            path, image, channel_names=tuple("RGBA"[:image.shape[-1]]), attributes=texts, into=t), told)
+        stated["levels"] = [{"size": p.side, "roughness": level.roughness, "error": level.error, "row": p.row,
+                             "column": p.column} for level, p in zip(levels, places, strict=True)]
+        return Encoded(path, engine.name, image.nbytes, lambda t: write_exr(
+            path, image, channel_names=tuple("RGBA"[:image.shape[-1]]), attributes=_attributes(made), into=t), stated)
     keys = {} if path.suffix == ".dds" else _keys(engine, made, [level.error for level in levels])
-    encoded = encode(file.stored, maps, key_values=keys)
-    told |= _clipped(encoded.clipped)
-    told["levels"] = [_level_told(level, decode(encoded.texture, k), level.texels) for k, level in enumerate(levels)]
-    return Target(path, engine.name, _size(encoded.texture),
-                  lambda t: write_texture(path, encoded.texture, zstd=file.zstd, into=t), told)
+    packed = encode(file.stored, maps, key_values=keys)
+    stated |= _clipped(packed.clipped)
+    stated["levels"] = [_level_stated(level, decode(packed.texture, k), level.texels) for k, level in enumerate(levels)]
+    return Encoded(path, engine.name, _size(packed.texture),
+                   lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t), stated)
+
+
+def _attributes(made: Made, more: Mapping[str, str | float] | None = None) -> dict[str, str | float]:
+    """The attributes of an OpenEXR image."""
+    return {f"whitefurnace:{key}": value for key, value in {**made.provenance, **(more or {})}.items()}
 
 
 # ---------------------------------------------------------------------------------------------- harmonics
@@ -235,21 +302,23 @@ SH_NAMES = ("L00", "L1-1", "L10", "L11", "L2-2", "L2-1", "L20", "L21", "L22")
 POLYNOMIAL_NAMES = ("x", "y", "z", "xx", "yy", "zz", "yz", "zx", "xy")
 
 
-def _sh_file(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
-    if made is None:
-        return Target(path, engine.name, 9 * 3 * 8)
+def _sh_size(engine: Engine, chain: Chain, file: File) -> int:
+    return 9 * 3 * 8
+
+
+def _sh_file(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     rows = _sh(engine, made)
     names = POLYNOMIAL_NAMES if engine.sh == "babylon" else SH_NAMES
     if file.suffix == ".json":
         text = json.dumps(dict(zip(names, rows.tolist(), strict=True)), indent=2) + "\n"
     else:
-        what = "irradiance, pre-scaled base" if engine.sh == "filament" else engine.sh
-        text = "".join(f"({r:18.15f}, {g:18.15f}, {b:18.15f}); // {name}, {what}\n"
+        scale = "irradiance, pre-scaled base" if engine.sh == "filament" else engine.sh
+        text = "".join(f"({r:18.15f}, {g:18.15f}, {b:18.15f}); // {name}, {scale}\n"
                        for name, (r, g, b) in zip(names, rows, strict=True))
     return _bytes(engine, path, text.encode(), {"holds": "sh", "scale": engine.sh, "error": made.lit.sh_error})
 
 
-# ---------------------------------------------------------------------------------------------- whole files
+# ---------------------------------------------------------------------------------------------- cubes with harmonics
 
 
 def _rgbd(levels: Sequence[Level], engine: Engine) -> tuple[list[np.ndarray], list[np.ndarray], int]:
@@ -261,24 +330,24 @@ def _rgbd(levels: Sequence[Level], engine: Engine) -> tuple[list[np.ndarray], li
 
 
 def _whole(engine: Engine, path: Path, levels: Sequence[Level], made: Made,
-           write: Callable[[Sequence[np.ndarray], Transaction], object]) -> Target:
+           write: Callable[[Sequence[np.ndarray], Transaction], object]) -> Encoded:
     """A container of RGBD faces with harmonics."""
     turned, back, clipped = _rgbd(levels, engine)
-    told = {"holds": "specular, sh", "format": "rgbd", **_clipped([clipped]), "scale": engine.sh,
-            "sh_error": made.lit.sh_error,
-            "levels": [_level_told(*one) for one in zip(levels, back, turned, strict=True)]}
+    stated = {"holds": "specular, sh", "format": "rgbd", **_clipped([clipped]), "scale": engine.sh,
+              "sh_error": made.lit.sh_error,
+              "levels": [_level_stated(*one) for one in zip(levels, back, turned, strict=True)]}
     inverse = np.array(engine.matrix).T
-    return Target(path, engine.name, sum(6 * 4 * t.shape[1] ** 2 for t in turned), lambda t: write(turned, t), told,
-                  tuple(turned_cube(texels, inverse) for texels in back))
+    return Encoded(path, engine.name, sum(6 * 4 * t.shape[1] ** 2 for t in turned), lambda t: write(turned, t), stated,
+                   tuple(turned_cube(texels, inverse) for texels in back))
 
 
-def _env(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> Target:
+def _env(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> Encoded:
     polynomials = _sh(engine, made) if engine.sh else None
     return _whole(engine, path, levels, made,
                   lambda turned, t: write_env(path, EnvMap(tuple(turned), polynomials), into=t))
 
 
-def _gltf(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> Target:
+def _gltf(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> Encoded:
     return _whole(engine, path, levels, made,
                   lambda turned, t: write_gltf_lights(path, GltfLight(tuple(turned), _sh(engine, made)), into=t))
 
@@ -286,63 +355,75 @@ def _gltf(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> Ta
 # ---------------------------------------------------------------------------------------------- lat-longs and tables
 
 
-def _environment(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
-    rows = 2 * chain.size
-    nbytes = (4 if file.suffix == ".hdr" else 12) * rows * 2 * rows
-    if made is None:
-        return Target(path, engine.name, nbytes)
+def _environment_size(engine: Engine, chain: Chain, file: File) -> int:
+    return (4 if file.suffix == ".hdr" else 12) * 8 * chain.size**2  # a lat-long of (2s, 4s)
+
+
+def _environment(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     level = made.chain.latlongs[0]
-    told: dict[str, Any] = {"holds": "environment", "format": file.stored}
+    rows, columns = level.texels.shape[:2]
+    stated: dict[str, Any] = {"holds": "environment", "format": file.stored}
     if file.suffix == ".exr":
         alpha = made.chain.latlong_coverage[0].texels[..., :1] if made.chain.latlong_coverage else None
         pixels = level.texels if alpha is None else np.concatenate([level.texels, alpha], -1)
-        texts = {f"whitefurnace:{name}": value for name, value in made.provenance.items()}
-        told |= {"levels": [{"size": 2 * rows, "roughness": 0.0, "error": level.error}]}
-        return Target(path, engine.name, nbytes, lambda t: write_exr(
-            path, pixels, channel_names=tuple("RGBA"[:pixels.shape[-1]]), attributes=texts, into=t), told)
-    told |= {"levels": [_level_told(level, unpack_hdr(pack_hdr(level.texels).data), level.texels)]}
-    return Target(path, engine.name, nbytes, lambda t: write_hdr(path, level.texels, into=t), told)
+        stated |= {"levels": [{"size": columns, "roughness": 0.0, "error": level.error}]}
+        return Encoded(path, engine.name, 12 * rows * columns, lambda t: write_exr(
+            path, pixels, channel_names=tuple("RGBA"[:pixels.shape[-1]]), attributes=_attributes(made), into=t), stated)
+    stated |= {"levels": [_level_stated(level, unpack_hdr(pack_hdr(level.texels).data), level.texels)]}
+    return Encoded(path, engine.name, 4 * rows * columns, lambda t: write_hdr(path, level.texels, into=t), stated)
 
 
-def _dfg(engine: Engine, chain: Chain, path: Path, file: File, made: Made | None) -> Target:
+def _dfg_size(engine: Engine, chain: Chain, file: File) -> int:
+    return _square_bytes(engine.dfg.size, file, 3 if engine.dfg.charlie else 2)
+
+
+def _dfg(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     n, channels = engine.dfg.size, 3 if engine.dfg.charlie else 2
-    if made is None:
-        return Target(path, engine.name, _square_bytes(n, file, channels))
     assert made.split is not None
     values = made.split.values
-    told = {"holds": "dfg", "format": file.stored, "size": n, "error": made.split.error, "rule": made.split.rule,
-            **({"charlie_error": made.split.charlie_error} if engine.dfg.charlie else {})}
+    stated = {"holds": "dfg", "format": file.stored, "size": n, "error": made.split.error, "rule": made.split.rule,
+              **({"charlie_error": made.split.charlie_error} if engine.dfg.charlie else {})}
     if file.suffix == ".exr":
-        return Target(path, engine.name, values.nbytes, lambda t: write_exr(
-            path, values, channel_names=tuple("RGB"[:channels]), into=t), told)
+        return Encoded(path, engine.name, values.nbytes, lambda t: write_exr(
+            path, values, channel_names=tuple("RGB"[:channels]), into=t), stated)
     wide = values
     if file.stored != "rg16f" and channels == 2:
         wide = np.concatenate([values, np.zeros_like(values[..., :1])], -1)
     if file.suffix == ".png":
-        packed = pack("rgbd", wide)
-        back = unpack("rgbd", packed.data, wide.shape[:-1])
-        told["format_worst"] = float(np.abs(back - wide).max())
-        return Target(path, engine.name, packed.data.nbytes, lambda t: write_png(path, packed.data, into=t), told)
+        png = pack("rgbd", wide)
+        back = unpack("rgbd", png.data, wide.shape[:-1])
+        stated["format_worst"] = float(np.abs(back - wide).max())
+        return Encoded(path, engine.name, png.data.nbytes, lambda t: write_png(path, png.data, into=t), stated)
     keys = _keys(engine, made, [made.split.error])
-    encoded = encode(file.stored, [wide], key_values={} if file.suffix == ".dds" else keys)
-    told["format_worst"] = float(np.abs(decode(encoded.texture, 0)[..., :channels] - values).max())
-    return Target(path, engine.name, _size(encoded.texture),
-                  lambda t: write_texture(path, encoded.texture, zstd=file.zstd, into=t), told)
+    packed = encode(file.stored, [wide], key_values={} if file.suffix == ".dds" else keys)
+    stated["format_worst"] = float(np.abs(decode(packed.texture, 0)[..., :channels] - values).max())
+    return Encoded(path, engine.name, _size(packed.texture),
+                   lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t), stated)
 
 
-_WRITERS = {"specular": _specular, "skybox": _skybox, "irradiance": _irradiance, "sheen": _sheen,
-            "environment": _environment, "sh": _sh_file, "dfg": _dfg}
+WRITERS = {
+    "specular": Writer(_specular_size, _specular),
+    "skybox": Writer(_skybox_size, _skybox),
+    "irradiance": Writer(_irradiance_size, _irradiance),
+    "sheen": Writer(_sheen_size, _sheen),
+    "environment": Writer(_environment_size, _environment),
+    "sh": Writer(_sh_size, _sh_file),
+    "dfg": Writer(_dfg_size, _dfg),
+}
+"""What an engine's file can hold, with what makes it."""
 
 
 # ---------------------------------------------------------------------------------------------- everything in one
 
 
-def _npz(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made | None) -> list[Target]:
-    path = folder / engine.name / f"{stem}.npz"
+def _npz_planned(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Target]:
     count = 3 * sum(6 * s * s for s, _ in chain.levels) + sum(n for holds, n in (
         ("irradiance", 3 * 6 * IRRADIANCE_SIZE**2), ("dfg", 2 * DFG_SIZE**2)) if engine.needs(holds))
-    if made is None:
-        return [Target(path, engine.name, 4 * count)]
+    return [Target(folder / engine.name / f"{stem}.npz", engine.name, 4 * count)]
+
+
+def _npz(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made) -> list[Encoded]:
+    (target,) = _npz_planned(engine, chain, folder, stem)
     lit, levels = made.lit, made.chain.levels
     arrays: dict[str, np.ndarray] = {f"specular_{k}": level.texels for k, level in enumerate(levels, chain.first)}
     for statistic in ("roughness", "error", "worst", "rmse"):
@@ -352,49 +433,67 @@ def _npz(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made | Non
     rest = {"irradiance": lit.irradiance.texels, "sh": lit.sh, "dfg": made.table.values}
     arrays |= {holds: array for holds, array in rest.items() if engine.needs(holds)}
     arrays |= {f"coverage_{k}": level.texels[..., 0] for k, level in enumerate(made.chain.coverage, chain.first)}
-    return [Target(path, engine.name, 4 * count, lambda t: write_npz(path, arrays, into=t),
-                   levels=tuple(level.texels for level in levels))]
+    return [Encoded(target.path, engine.name, target.nbytes, lambda t: write_npz(target.path, arrays, into=t),
+                    levels=tuple(level.texels for level in levels))]
 
 
-def _exr(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made | None) -> list[Target]:
-    found: list[Target] = []
+@dataclass(frozen=True)
+class _Image:
+    """An OpenEXR image of `exr`: the end of its name, its rows and columns, its channels without coverage."""
 
-    def add(ending: str, shape: tuple[int, int], texels: np.ndarray | None, alpha: np.ndarray | None = None,
-            channels: str = "RGB", attributes: Mapping[str, str | float] | None = None) -> None:
-        path = folder / engine.name / f"{stem}_{ending}.exr"
-        nbytes = 4 * shape[0] * shape[1] * len(channels)
-        if texels is None or made is None:
-            found.append(Target(path, engine.name, nbytes))
-            return
-        pixels = texels.reshape(*shape, -1)
-        names = channels
-        if alpha is not None:
-            pixels, names = np.concatenate([pixels, alpha.reshape(*shape, 1)], -1), "RGBA"
-        told = {f"whitefurnace:{key}": value for key, value in {**made.provenance, **(attributes or {})}.items()}
-        found.append(Target(path, engine.name, nbytes, lambda t: write_exr(
-            path, pixels, channel_names=tuple(names), attributes=told, into=t)))
+    ending: str
+    shape: tuple[int, int]
+    channels: str = "RGB"
 
-    for k, (size, _) in enumerate(chain.levels):
-        cube, wide = (6 * size, size), (2 * size, 4 * size)
-        if made is None:
-            add(f"specular_{k + chain.first}", cube, None)
-            add(f"specular_{k + chain.first}_latlong", wide, None)
-            continue
-        for ending, shape, level, coverage in (
-            (f"specular_{k + chain.first}", cube, made.chain.levels[k], made.chain.coverage),
-            (f"specular_{k + chain.first}_latlong", wide, made.chain.latlongs[k], made.chain.latlong_coverage),
-        ):
-            add(ending, shape, level.texels, coverage[k].texels[..., 0] if coverage else None, attributes={
-                "roughness": level.roughness, "error": level.error, "worst": level.worst, "rmse": level.rmse,
-                "method": level.method})
-    irradiance = (6 * IRRADIANCE_SIZE, IRRADIANCE_SIZE)
+    def target(self, engine: Engine, folder: Path, stem: str) -> Target:
+        rows, columns = self.shape
+        return Target(folder / engine.name / f"{stem}_{self.ending}.exr", engine.name,
+                      4 * rows * columns * len(self.channels))
+
+
+def _images(engine: Engine, chain: Chain) -> dict[str, _Image]:
+    """The images of `exr` by the end of their names."""
+    found = []
+    for k, (size, _) in enumerate(chain.levels, chain.first):
+        found += [_Image(f"specular_{k}", (6 * size, size)), _Image(f"specular_{k}_latlong", (2 * size, 4 * size))]
     if engine.needs("irradiance"):
-        add("irradiance", irradiance, made.lit.irradiance.texels if made else None, attributes={
-            "error": made.lit.irradiance.error, "sh": json.dumps(made.lit.sh.tolist())} if made else None)
+        found.append(_Image("irradiance", (6 * IRRADIANCE_SIZE, IRRADIANCE_SIZE)))
     if engine.needs("dfg"):
-        add("dfg", (DFG_SIZE, DFG_SIZE), made.table.values if made else None, channels="RG",
-            attributes={"error": made.table.error, "rule": made.table.rule} if made else None)
+        found.append(_Image("dfg", (DFG_SIZE, DFG_SIZE), "RG"))
+    return {image.ending: image for image in found}
+
+
+def _exr_planned(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Target]:
+    return [image.target(engine, folder, stem) for image in _images(engine, chain).values()]
+
+
+def _exr(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made) -> list[Encoded]:
+    found: list[Encoded] = []
+    images = _images(engine, chain)
+
+    def add(ending: str, texels: np.ndarray, more: Mapping[str, str | float], alpha: np.ndarray | None = None) -> None:
+        image = images[ending]
+        target = image.target(engine, folder, stem)
+        pixels, names = texels.reshape(*image.shape, -1), image.channels
+        if alpha is not None:
+            pixels, names = np.concatenate([pixels, alpha.reshape(*image.shape, 1)], -1), "RGBA"
+        found.append(Encoded(target.path, engine.name, target.nbytes, lambda t: write_exr(
+            target.path, pixels, channel_names=tuple(names), attributes=_attributes(made, more), into=t)))
+
+    for k in range(len(chain.levels)):
+        for ending, level, coverage in (
+            (f"specular_{k + chain.first}", made.chain.levels[k], made.chain.coverage),
+            (f"specular_{k + chain.first}_latlong", made.chain.latlongs[k], made.chain.latlong_coverage),
+        ):
+            add(ending, level.texels, {
+                "roughness": level.roughness, "error": level.error, "worst": level.worst, "rmse": level.rmse,
+                "method": level.method}, coverage[k].texels[..., 0] if coverage else None)
+    if "irradiance" in images:
+        add("irradiance", made.lit.irradiance.texels,
+            {"error": made.lit.irradiance.error, "sh": json.dumps(made.lit.sh.tolist())})
+    if "dfg" in images:
+        add("dfg", made.table.values, {"error": made.table.error, "rule": made.table.rule})
     return found
 
 
-CONTAINERS = {"npz": _npz, "exr": _exr}
+CONTAINERS = {"npz": Container(_npz_planned, _npz), "exr": Container(_exr_planned, _exr)}
