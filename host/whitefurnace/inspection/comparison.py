@@ -1,5 +1,7 @@
-"""Two files against each other, whatever their containers: the error of every level by the project's definition, of
-spherical harmonics and of tables; the second file is the reference."""
+"""Compares two files of any containers; the second is the reference.
+
+Computes the error of every level by the project's definition, and the errors of spherical harmonics and of tables.
+"""
 from __future__ import annotations
 
 import itertools
@@ -21,25 +23,36 @@ from whitefurnace.sphere.overlap import mean_over_texels
 
 AXES = "xyz"
 SAME_ROUGHNESS = 1e-4
-"""Perceptual roughness of one level as different files may say it: a few units of the last digit of a text."""
+"""Largest difference between the perceptual roughness that two files state for one level: rounding of texts."""
 
 CUBE_TEXELS, LATLONG_TEXELS, ROW_TEXELS = 6 * 256**2, 2 * 64**2, 2 * 256**2
-"""Texels up to which exact overlaps take about five seconds: of a cube (12 µs each), of a lat-long laid on a cube
-(300 µs) and on another lat-long (30 µs)."""
+"""Largest numbers of texels for which exact overlaps take about five seconds.
+
+They are those of a cube (12 µs each), of a lat-long against a cube (300 µs), and against another lat-long (30 µs).
+"""
 
 ALIKE = 1.01
-"""Ratio of the angles of two grids' texels up to which either may be taken for the coarser."""
+"""Largest ratio of the texel angles of two grids at which either may count as the coarser one."""
 
 MIRRORED = 0.2
-"""A turned or mirrored cube is suspected where one of the 48 symmetries leaves less than this share of the error."""
+"""A cube is reported as turned or mirrored if one of the 48 symmetries leaves less than this share of the error."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One pair. `error` is the 99th percentile of its errors and `worst` the largest: texel errors of levels (max over
-    channels of |a - b| / max(b, 1e-3 · mean of b)), absolute differences of tables, and of `sh` differences over the
-    largest L00. `rmse` is relative and weighted with solid angles; None but for levels. `stated` is what A's own
-    statement says of `error`; `at` where the worst is; `errors` (6, n, n) or (h, w), for maps."""
+    """The errors of one pair of levels, tables or coefficients.
+
+    part       name of the part; `kind` is "level", "table" or "sh"
+    size       size in texels or cells; `method` says how the pair was compared
+    error      99th percentile of the errors; `worst` is the largest. For levels these are texel errors, the max over
+               channels of |a − b| / max(b, 1e-3 · mean of b); for tables absolute differences; for spherical harmonics
+               differences over the largest L00
+    rmse       relative root mean square difference, weighted with solid angles; None except for levels
+    at         place of the largest error
+    roughness  perceptual roughness of a level, where it is known
+    stated     the error that A's manifest states
+    errors     all errors, (6, n, n) or (h, w), for maps
+    """
 
     part: str
     kind: str  # "level", "table" or "sh"
@@ -55,13 +68,17 @@ class Row:
 
     @property
     def bounded(self) -> float:
-        """What `--max-error` is held against: the percentile of a level, the largest of anything else."""
+        """The error that `--max-error` limits: the percentile for a level, the largest error for other parts."""
         return self.error if self.kind == "level" else self.worst
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """`rows` in the order of B's parts; `notices` are sentences on how, and on what had no counterpart."""
+    """The result of comparing `a` with the reference `b`.
+
+    rows     the compared parts, in the order of B's
+    notices  sentences about the method, and about parts without a counterpart
+    """
 
     a: Contents
     b: Contents
@@ -69,27 +86,30 @@ class Comparison:
     notices: tuple[str, ...]
 
     def beyond(self, bound: float) -> Row | None:
-        """The row furthest beyond a bound, or None."""
+        """Return the row that exceeds a bound the most, or None."""
         worst = max(self.rows, key=lambda row: row.bounded)
         return worst if not worst.bounded <= bound else None
 
 
 def axes_of(text: str) -> np.ndarray:
-    """(3, 3) P of "-x +y +z", or of an engine's name: what lies in our direction d is stored at P · d. Raises
-    UsageError."""
+    """Return the matrix P (3, 3) of axes such as "-x +y +z", or of an engine by its name.
+
+    The radiance from direction d in our axes is stored at P · d. Raises UsageError.
+    """
     if text in ENGINES:
         text = ENGINES[text].axes
     return np.array(axes_matrix(text), np.float64)
 
 
 def compare(a: Contents, b: Contents, *, axes_a: str | None = None, axes_b: str | None = None) -> Comparison:
-    """What `a` is off from the reference `b`.
+    """Compare `a` with the reference `b`.
 
-    Levels are matched by size, and by roughness where both tell it; where no size is common, the first level of each is
-    compared: by the means of the finer over the texels of the coarser (exact overlaps), or, where that would take long
-    or a level is rougher than a mean, by a bilinear read of A at the texel centres of B, which is said. Arrays are
-    compared layer by layer. axes_a, axes_b: the axes that a file is stored in, where they are not ours (`axes_of`).
-    Raises UsageError, and UnsupportedError for what cannot be held against each other.
+    Levels are matched by size, and by roughness where both files state it. Where no size is common, the first levels
+    are compared: by the means of the finer over the texels of the coarser (exact overlaps), or, where that takes too
+    long or a level is not of roughness 0, by a bilinear read of A at the texel centres of B. A notice says which.
+    Arrays are compared layer by layer.
+    axes_a, axes_b: the axes that a file is stored in, where they are not ours (`axes_of`).
+    Raises UsageError for invalid axes, and UnsupportedError for contents that cannot be compared.
     """
     notices: list[str] = []
     a, b = (_in_ours(_parted(found), axes, notices) for found, axes in ((a, axes_a), (b, axes_b)))
@@ -136,7 +156,7 @@ def _levels(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
 
 
 def _matched(a: Contents, b: Contents, notices: list[str]) -> list[tuple[Level, Level]]:
-    """Pairs of levels (of A, of B)."""
+    """Return pairs of levels (of A, of B) in the order of B; levels without a counterpart get a notice."""
     found: list[tuple[Level, Level]] = []
     free = list(a.levels)
     for other in b.levels:
@@ -157,7 +177,7 @@ def _matched(a: Contents, b: Contents, notices: list[str]) -> list[tuple[Level, 
                 notices.append(", ".join(f"{level.name} ({_size(level)})" for level in alone) +
                                f" of {whole.path.name}: no counterpart")
         return sorted(found, key=lambda pair: b.levels.index(pair[1]))
-    # A lone level whose roughness is known goes with the level of that roughness, else the first with the first.
+    # No size is common: compare a pair of the same known roughness, else the first levels.
     by_roughness = [(one, other) for one in a.levels for other in b.levels
                     if one.roughness is not None and other.roughness is not None and _same(one, other)]
     one, other = by_roughness[0] if by_roughness else (a.levels[0], b.levels[0])
@@ -178,7 +198,7 @@ def _size(level: Level) -> str:
 
 
 def _colours(texels: np.ndarray) -> np.ndarray:
-    """Three channels: grey is spread, coverage left out."""
+    """Return three channels: grey is repeated, coverage is left out."""
     if texels.shape[-1] == 2:
         raise UnsupportedError("a cube or lat-long of two channels is no radiance and is not compared")
     return np.repeat(texels, 3, -1) if texels.shape[-1] == 1 else texels[..., :3]
@@ -196,7 +216,7 @@ def _sphere(part: str, one: Level, other: Level, notices: list[str]) -> Row:
     a, b = a.reshape(-1, 3).astype(np.float64), b.reshape(-1, 3).astype(np.float64)
     weights = _angles(latlong, dims)
     wrong = ~(np.isfinite(a) & np.isfinite(b)).all(1)
-    # What is not finite is an infinite error, unless both have the same there.
+    # A texel that is not finite has an infinite error, unless both files have the same value there.
     unlike = wrong & ~((a == b) | (np.isnan(a) & np.isnan(b))).all(1)
     if wrong.any():
         a, b = np.where(wrong[:, None], 0.0, a), np.where(wrong[:, None], 0.0, b)
@@ -234,14 +254,17 @@ def _angles(latlong: bool, dims: Sequence[int]) -> np.ndarray:
 
 
 def percentile(errors: np.ndarray) -> float:
-    """The 99th percentile of all errors: the least of them that no more than a hundredth exceeds."""
+    """Return the 99th percentile of all errors: the smallest error that at most one in a hundred exceeds."""
     flat = errors.ravel()
     rank = max(math.ceil(0.99 * flat.size) - 1, 0)
     return float(np.partition(flat, rank)[rank])
 
 
 def _laid(a: np.ndarray, b: np.ndarray, means: bool) -> tuple[np.ndarray, np.ndarray, str, str]:
-    """A and B over the same texels, how, and a sentence that says so."""
+    """Bring A and B to the same texels; return both, the name of the method, and a sentence about it.
+
+    means: whether both levels have roughness 0, so that means over texels are comparable.
+    """
     angles = [math.pi / 2 / x.shape[1] if x.ndim == 4 else math.pi / x.shape[0] for x in (a, b)]
     order = [(a, b), (b, a)] if angles[1] >= angles[0] else [(b, a), (a, b)]
     for fine, coarse in order[:2 if max(angles) <= ALIKE * min(angles) else 1]:
@@ -268,7 +291,7 @@ def _affordable(fine: np.ndarray, coarse: np.ndarray) -> bool:
 
 
 def _read_latlong(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """(m, 3): a lat-long read bilinearly in directions (3, m), on over the poles."""
+    """Read a lat-long bilinearly in directions (3, m), across the poles too; return (m, 3)."""
     rows, columns = texels.shape[:2]
     x = (np.arctan2(d[2], d[0]) / (2 * math.pi) + 0.5) * columns - 0.5
     y = np.arccos(np.clip(d[1], -1, 1)) / math.pi * rows - 0.5
@@ -285,7 +308,7 @@ def _read_latlong(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 
 def _symmetry(pairs: Sequence[tuple[Level, Level]]) -> list[str]:
-    """Whether A's cube fits far better turned or mirrored."""
+    """Return a notice where A's cube agrees far better after a turn or a reflection; else an empty list."""
     alike = [(one, other) for one, other in pairs if one.texels.ndim == 4 and one.texels.shape == other.texels.shape
              and one.size > 1]
     if not alike:
@@ -297,12 +320,12 @@ def _symmetry(pairs: Sequence[tuple[Level, Level]]) -> list[str]:
         return float(((texels - b) ** 2).sum())
 
     now = off(a)
-    if now <= 1e-4 * float((b * b).sum()):  # an RMSE of 1 %: nothing is turned
+    if now <= 1e-4 * float((b * b).sum()):  # with an RMSE below 1 % the cube is not turned
         return []
     least, best = min((off(turned_cube(a, axes.T)), text)
                       for text, axes in _symmetries())
     if least > MIRRORED**2 * now:
-        # No symmetry of the sphere: each face by itself.
+        # Not a symmetry of the cube: try to turn or mirror each face by itself.
         flips = {"left to right": a[:, :, ::-1], "upside down": a[:, ::-1], "by half a turn": a[:, ::-1, ::-1]}
         least, best = min((off(texels), name) for name, texels in flips.items())
         return [] if least > MIRRORED**2 * now else [
@@ -313,14 +336,14 @@ def _symmetry(pairs: Sequence[tuple[Level, Level]]) -> list[str]:
 
 
 def _reduced(texels: np.ndarray) -> np.ndarray:
-    """Means of squares of texels, 64² a face at most, float64."""
+    """Average square blocks of texels to at most 64² a face, in float64."""
     n = texels.shape[1]
     step = next((k for k in range(1, n + 1) if n % k == 0 and n // k <= 64), n)
     return texels.reshape(6, n // step, step, n // step, step, 3).mean((2, 4), dtype=np.float64)
 
 
 def _symmetries() -> Iterator[tuple[str, np.ndarray]]:
-    """The 48 of the cube, the plain one among them."""
+    """Yield the 48 symmetries of the cube as text and matrix, the identity among them."""
     for order in itertools.permutations(AXES):
         for signs in itertools.product("+-", repeat=3):
             text = " ".join(sign + letter for sign, letter in zip(signs, order, strict=True))
@@ -331,7 +354,7 @@ def _symmetries() -> Iterator[tuple[str, np.ndarray]]:
 
 
 def _in_ours(found: Contents, axes: str | None, notices: list[str]) -> Contents:
-    """Contents in our axes: those given, else a cube's of the engine that it was written for."""
+    """Turn contents to our axes, from the given axes or from those of the engine that a cube was written for."""
     if axes is None and (found.cube or found.kind == "harmonics") and found.written_for is not None:
         engine, text = found.written_for
         if not np.array_equal(axes_of(text), np.eye(3)):
@@ -341,14 +364,14 @@ def _in_ours(found: Contents, axes: str | None, notices: list[str]) -> Contents:
 
 
 def _parted(found: Contents) -> Contents:
-    """A file of irradiance alone with that where it is compared as such."""
+    """Move the level of a file that holds irradiance alone to `irradiance`, so that it is compared as irradiance."""
     if found.holds != "irradiance" or not found.cube or len(found.levels) != 1 or found.irradiance is not None:
         return found
     return replace(found, levels=(), irradiance=replace(found.levels[0], name="irradiance"))
 
 
 def _turned(found: Contents, axes: np.ndarray) -> Contents:
-    """The contents in our axes."""
+    """Turn contents from `axes` to ours. Raises UnsupportedError for contents without directions."""
     if not _is_sphere(found) and found.levels:
         raise UnsupportedError(f"{found.path} holds {found.kind}: axes are of cubes and lat-longs")
     levels = tuple(replace(level, texels=_along(level.texels, axes, found)) for level in found.levels)
@@ -358,7 +381,7 @@ def _turned(found: Contents, axes: np.ndarray) -> Contents:
 
 
 def _along(texels: np.ndarray, axes: np.ndarray, found: Contents) -> np.ndarray:
-    if texels.ndim >= 4:  # back from P · d: by the transposed
+    if texels.ndim >= 4:  # the transpose of P undoes P · d
         cubes = [turned_cube(cube, axes.T) for cube in texels.reshape(-1, *texels.shape[-4:])]
         return np.stack(cubes).reshape(texels.shape)
     rows, columns, _ = texels.shape
@@ -406,7 +429,7 @@ def _table(part: str, one: Level, other: Level, notices: list[str]) -> Iterator[
 
 
 def _others(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
-    """Irradiance, spherical harmonics and a table beside levels, where both have them."""
+    """Compare the irradiance, the spherical harmonics and the DFG table, where both files have them."""
     if a.irradiance is not None and b.irradiance is not None:
         yield _sphere("irradiance", replace(a.irradiance, roughness=None), replace(b.irradiance, roughness=None),
                       notices)

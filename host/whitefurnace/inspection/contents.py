@@ -1,5 +1,7 @@
-"""Any file that we or an engine know, brought into one shape: levels as floats, spherical harmonics, texts, facts of
-the header, and what we stated of it where it is ours."""
+"""Reads any file of this tool or of an engine into one type: float levels, spherical harmonics, texts and header facts.
+
+For files that this tool wrote, the statements of their manifests are read too.
+"""
 from __future__ import annotations
 
 import json
@@ -36,10 +38,10 @@ from whitefurnace.sphere.harmonics import SCALINGS, unscaled
 KINDS = ("cube", "cube array", "lat-long", "image", "image array", "table", "arrays", "harmonics", "code",
          "manifest")
 FIGURES = ("error", "worst", "rmse", "format_p99", "format_worst")
-"""What a manifest tells of a level: the filter's error, and what the pixel format adds."""
+"""Errors that a manifest states for a level: those of the filter, and those that the pixel format adds."""
 
 PREFIX = "whitefurnace:"
-"""Of our own key-values and attributes."""
+"""Prefix of the key-values and attributes that this tool writes."""
 
 CONTAINERS = {".ktx": "KTX 1", ".ktx2": "KTX 2", ".dds": "DDS", ".env": "Babylon .env", ".gltf": "glTF"}
 TITLES = {"openexr": "OpenEXR", "hdr": "Radiance HDR", "png": "PNG", "tiff": "TIFF", "jpeg": "JPEG", "dds": "DDS"}
@@ -47,9 +49,13 @@ TITLES = {"openexr": "OpenEXR", "hdr": "Radiance HDR", "png": "PNG", "tiff": "TI
 
 @dataclass(frozen=True)
 class Level:
-    """One mip, table or array. `texels` float32: (6, n, n, c) or (h, w, c), an array of either with an axis before;
-    `roughness` perceptual, where the file or its manifest tells it; `stored` its bytes in the file, where it has bytes
-    of its own; `stated` our own figures (error, worst, rmse)."""
+    """One mip level, table or array.
+
+    texels     float32: (6, n, n, c) or (h, w, c); arrays of either have one more axis in front
+    roughness  perceptual roughness, where the file or its manifest states it
+    stored     bytes in the file, where the level has bytes of its own
+    stated     errors that this tool stated for it, by their names in FIGURES
+    """
 
     name: str
     texels: np.ndarray
@@ -59,33 +65,39 @@ class Level:
 
     @property
     def size(self) -> int:
-        """The face edge of a cube, the height of anything else."""
+        """The side of a cube's faces, or the height of any other level, in texels."""
         return self.texels.shape[-3]
 
 
 @dataclass(frozen=True)
 class Statement:
-    """What we said of a file of ours: `manifest` is the one that lists it, None where only the file's own attributes
-    speak; `whole` whether that manifest's digest is the file's."""
+    """Statements of this tool about a file that it wrote.
+
+    manifest  path of the manifest that lists the file; None where the statements are attributes of the file itself
+    whole     whether the digest in the manifest is that of the file
+    stated    the statements by name
+    """
 
     manifest: Path | None
     whole: bool | None
-    told: Mapping[str, Any]
+    stated: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Contents:
-    """What a file holds.
+    """The contents of a file.
 
     kind         one of KINDS
     container    "KTX 2", "DDS", "OpenEXR", "npz" …; `format` the pixel format in words
-    levels       the first the largest; what is prefiltered lies GL-direct
-    irradiance   (6, n, n, 3) E/π, where the file has it apart
-    sh           (9, 3) radiance coefficients in the project's basis, whatever scale the file has them in
-    dfg          (h, w, c), a table beside levels
-    keys         texts of the file: key-values, attributes
-    facts        of the header, ready to be shown
-    largest      the largest finite value that each channel of the format holds; () where that is no limit to meet
+    levels       levels from the largest to the smallest; prefiltered cubes are GL-direct
+    irradiance   (6, n, n, 3) E/π, where the file stores it separately
+    sh           (9, 3) radiance coefficients in the project's basis, converted from the scale of the file
+    dfg          (h, w, c), a DFG table stored with the levels
+    keys         texts of the file: key-values and attributes
+    facts        facts of the header for display
+    largest      largest finite value that each channel of the format holds; () where values do not reach it
+    statement    statements of this tool, where it wrote the file
+    notices      sentences about assumptions and about data that could not be decoded
     """
 
     path: Path
@@ -104,13 +116,15 @@ class Contents:
 
     @property
     def written_for(self) -> tuple[str, str] | None:
-        """The engine that it was written for and the axes of that, where its manifest or its keys say so: a user's as
-        the bake was given it."""
-        told = self.statement.told if self.statement is not None else {}
-        name = self.keys.get(f"{PREFIX}engine", told.get("engine"))
+        """The engine that the file was written for, and its axes; None where neither manifest nor keys state them.
+
+        The axes of a user's engine are those that the bake received.
+        """
+        stated = self.statement.stated if self.statement is not None else {}
+        name = self.keys.get(f"{PREFIX}engine", stated.get("engine"))
         if not isinstance(name, str):
             return None
-        axes: Any = told
+        axes: Any = stated
         for part in ("recipe", "engines", name, "engine", "axes"):
             axes = axes.get(part) if isinstance(axes, Mapping) else None
         if name in ENGINES and not isinstance(axes, str):
@@ -123,11 +137,14 @@ class Contents:
 
     @property
     def holds(self) -> str | None:
-        """What its manifest says that it is: one of engines.HOLDS; a strip of ours with harmonics is irradiance."""
-        told = self.statement.told if self.statement is not None else {}
+        """The use of the file that its manifest states, a key of engines.HOLDS; None where it states none.
+
+        An EXR strip of this tool with harmonics holds irradiance.
+        """
+        stated = self.statement.stated if self.statement is not None else {}
         if self.container == "OpenEXR" and self.sh is not None:
             return "irradiance"
-        return told["holds"].split(",")[0] if isinstance(told.get("holds"), str) else None
+        return stated["holds"].split(",")[0] if isinstance(stated.get("holds"), str) else None
 
     @property
     def cube(self) -> bool:
@@ -135,10 +152,10 @@ class Contents:
 
 
 def contents(path: str | os.PathLike[str]) -> Contents:
-    """What is in a file: our .npz, .npy, .exr and manifests, KTX 1, KTX 2, DDS, Babylon .env, glTF, and images.
+    """Read a file: .npz, .npy, .exr, .h and manifests of this tool, KTX 1, KTX 2, DDS, Babylon .env, glTF, or an image.
 
-    Raises `FileError` for what cannot be read, `InputError` for what is not valid or not known. What cannot be
-    decoded here for want of a package has no levels, and a notice.
+    A file whose decoder is not installed has no levels, and a notice with the reason. Raises `FileError` for a file
+    that cannot be read, and `InputError` for one that is not valid or of an unknown format.
     """
     path = Path(path)
     if path.is_dir():
@@ -171,16 +188,16 @@ def _of_manifest(path: Path) -> Contents:
     if found is None:
         raise InputError(f"{path} is not a manifest of whitefurnace, which is JSON and begins with its version")
     files = _files(found)
-    if isinstance(found.get("sha256"), str):  # of a table, beside its file
+    if isinstance(found.get("sha256"), str):  # the manifest of a table lists that one file
         files = {path.name.removesuffix(".json"): found}
-    whole = bool(files) and all(_is(path.parent / name, entry) for name, entry in files.items())
+    whole = bool(files) and all(_matches(path.parent / name, entry) for name, entry in files.items())
     facts: dict[str, str | int] = {"lists": ", ".join(sorted(files)) or "no files", "bytes": size}
     return Contents(path, "manifest", "JSON", "a manifest of whitefurnace", (), sh=_manifest_sh(found), facts=facts,
-                    statement=Statement(path, whole, _told(found)))
+                    statement=Statement(path, whole, _without_files(found)))
 
 
 def _is_harmonics(path: Path) -> bool:
-    """Whether JSON holds nine coefficients by name, and is no manifest."""
+    """Return whether a JSON file holds nine coefficients by name; otherwise it is a manifest."""
     try:
         read_sh(path)
     except (FileError, InputError):
@@ -189,10 +206,10 @@ def _is_harmonics(path: Path) -> bool:
 
 
 def _of_harmonics(path: Path, statement: Statement | None) -> Contents:
-    """A text of nine coefficients. Filament's cmgen names the scale in its lines; else a manifest does."""
+    """Read a text of nine coefficients. Their scale is stated by the manifest, or by comments of Filament's cmgen."""
     values = read_sh(path)
-    told = statement.told.get("scale") if statement is not None else None
-    scale = told if isinstance(told, str) and told in SCALINGS else None
+    stated = statement.stated.get("scale") if statement is not None else None
+    scale = stated if isinstance(stated, str) and stated in SCALINGS else None
     if scale is None and b"pre-scaled base" in path.read_bytes():
         scale = "filament"
     notices = () if scale else ("nothing says the scale of the coefficients; they are taken as the radiance's",)
@@ -202,11 +219,11 @@ def _of_harmonics(path: Path, statement: Statement | None) -> Contents:
 
 
 def _of_header(path: Path, statement: Statement | None) -> Contents:
-    """A table as a C array; or macros, which are not evaluated."""
+    """Read a C header: the array of a table, or macros, which are not evaluated."""
     array, facts = read_header(path), {"bytes": path.stat().st_size}
     if array is None:
         return Contents(path, "code", "C header", "macros", (), facts=facts, statement=statement)
-    level = Level("the table", _floats(path, array, "table"), stated=_numbers(statement, "error"))
+    level = Level("the table", _floats(path, array, "table"), stated=_stated_figures(statement, "error"))
     form = f"an array of {' × '.join(map(str, array.shape))}"
     return Contents(path, "table", "C header", form, (level,), facts=facts, statement=statement)
 
@@ -219,7 +236,7 @@ def _of_arrays(path: Path, statement: Statement | None) -> Contents:
         form = f"{array.dtype.name}, array of {' × '.join(map(str, array.shape)) or '1'}"
         kind = "table" if table else _kind_of(array.shape)
         level = Level("the table" if kind == "table" else "level 0", _floats(path, array, kind), stored=array.nbytes,
-                      stated=_numbers(statement, "error"))
+                      stated=_stated_figures(statement, "error"))
         return Contents(path, kind, "npy", form, (level,), facts={"bytes": size}, statement=statement)
     names = list(arrays)
     form = " and ".join(sorted({array.dtype.name for array in arrays.values()}))
@@ -247,7 +264,7 @@ def _of_arrays(path: Path, statement: Statement | None) -> Contents:
         if array.ndim != ndim or not square or not array.size:
             raise InputError(f"{path} is not valid: its {name} is an array of {array.shape}")
         return Level(name, _floats(path, array, name), stored=array.nbytes,
-                     stated=_numbers(statement, "error", "worst", "rmse", within=name))
+                     stated=_stated_figures(statement, "error", "worst", "rmse", within=name))
 
     sh = arrays.get("sh")
     if sh is not None and sh.shape != (9, 3):
@@ -267,12 +284,12 @@ def _of_light(path: Path, statement: Statement | None) -> Contents:
                         light.facts, light.largest, statement, (light.undecoded,))
     kind, placed, notices = _light_kind(light, statement)
     roughness = _roughness_of(light, statement, placed)
-    stated = _levels_told(statement)
-    if own and not stated:  # an error a level
-        numbers = [_number(_value(word)) for word in own.get("error", "").split()]
+    stated = _stated_levels(statement)
+    if own and not stated:  # the key `error` has one number for each level
+        numbers = [_stated_number(_value(word)) for word in own.get("error", "").split()]
         stated = {k: {"error": number} for k, number in enumerate(numbers) if number is not None}
     if kind == "table":
-        stated = {0: _numbers(statement, "error", "format_worst")}
+        stated = {0: _stated_figures(statement, "error", "format_worst")}
     levels = tuple(
         Level("the table" if kind == "table" and k == 0 else f"level {k}", texels, r, stored,
               _figures(stated.get(k, {})))
@@ -284,7 +301,7 @@ def _of_light(path: Path, statement: Statement | None) -> Contents:
 
 
 def _light_kind(light: Light, statement: Statement | None) -> tuple[str, Sequence[np.ndarray], tuple[str, ...]]:
-    """The kind, the levels as that kind has them, and what is to be said of it."""
+    """Return the kind of a light, its levels in the layout of that kind, and notices."""
     first = light.levels[0]
     if light.cube:
         return "cube array" if light.layers else "cube", light.levels, ()
@@ -306,50 +323,50 @@ def _light_kind(light: Light, statement: Statement | None) -> tuple[str, Sequenc
 
 def _of_image(path: Path, statement: Statement | None) -> Contents:
     facts = image_facts(path)
-    told = dict(facts.attributes)
-    if statement is None and told:
-        statement = Statement(None, None, {**told, **_parsed(told)})
+    attributes = dict(facts.attributes)
+    if statement is None and attributes:
+        statement = Statement(None, None, {**attributes, **_parsed(attributes)})
     container = TITLES.get(facts.format, facts.format)
     packed = f", {facts.compression}" if facts.compression else ""
     form = f"{facts.pixel}, {len(facts.channels)} channels ({' '.join(facts.channels)}){packed}"
     shown: dict[str, str | int] = {"width": facts.width, "height": facts.height, "bytes": path.stat().st_size}
-    keys = {name: str(value) for name, value in told.items() if name in ("method", "rule", "notices")}
+    keys = {name: str(value) for name, value in attributes.items() if name in ("method", "rule", "notices")}
     largest = {"half": 65504.0, "uint8": 1.0, "uint16": 1.0}.get(facts.pixel)
     limit = (largest,) * len(facts.channels) if largest else ()
-    if _is_table(statement) or "rule" in told or len(facts.channels) == 2:
-        stated = _figures(told) or _numbers(statement, "error", "format_worst")
+    if _is_table(statement) or "rule" in attributes or len(facts.channels) == 2:
+        stated = _figures(attributes) or _stated_figures(statement, "error", "format_worst")
         level = Level("the table", _table_of(path, facts.format, statement), stated=stated)
-        limit = () if statement is not None and statement.told.get("format") == "rgbd" else limit
+        limit = () if statement is not None and statement.stated.get("format") == "rgbd" else limit
         return Contents(path, "table", container, form, (level,), keys=keys, facts=shown, largest=limit,
                         statement=statement)
     image = read_image(path)
-    atlas = statement is not None and statement.told.get("layout") == "octahedral"
+    atlas = statement is not None and statement.stated.get("layout") == "octahedral"
     found = None if atlas else faces_of(image.pixels)
     name, texels = found if found is not None else ("", image.pixels)
     kind = "image" if not name or image.pixels.shape[:2] == (1, 1) else "lat-long" if name == "latlong" else "cube"
     if name or atlas:
         shown["layout"] = name or "octahedral maps of all levels"
-    row = {**_levels_told(statement).get(0, {}), **told}
-    level = Level("level 0", texels, _number(row.get("roughness")), None, _figures(row))
-    sh = told.get("sh")
+    row = {**_stated_levels(statement).get(0, {}), **attributes}
+    level = Level("level 0", texels, _stated_number(row.get("roughness")), None, _figures(row))
+    sh = attributes.get("sh")
     return Contents(path, kind, container, form, (level,), None, _sh_text(sh) if isinstance(sh, str) else None,
                     keys=keys, facts=shown, largest=limit, statement=statement, notices=image.notices)
 
 
 def _is_table(statement: Statement | None) -> bool:
-    """Whether a manifest says so: of `lut`, or of a bake's file."""
-    return statement is not None and ("integral" in statement.told or statement.told.get("holds") == "dfg")
+    """Return whether the manifest states that the file is a table, written by `lut` or as the DFG table of a bake."""
+    return statement is not None and ("integral" in statement.stated or statement.stated.get("holds") == "dfg")
 
 
 def _table_of(path: Path, container: str, statement: Statement | None) -> np.ndarray:
-    """The values of a table as its shader reads them; RGBD where the manifest says that it is."""
-    if container == "png" and statement is not None and statement.told.get("format") == "rgbd":
+    """Read the values of a table as its shader does: stored values, or RGBD where the manifest states that format."""
+    if container == "png" and statement is not None and statement.stated.get("format") == "rgbd":
         return read_rgbd(path)
     return read_stored(path)
 
 
 def _kind_of(shape: tuple[int, ...]) -> str:
-    """What an array without a manifest looks like."""
+    """Return the kind of an array without a manifest, by its shape."""
     if len(shape) == 4 and shape[0] == 6 and shape[1] == shape[2] and shape[3] in (1, 3, 4):
         return "cube"
     if len(shape) == 3 and shape[1] == 2 * shape[0] and shape[2] in (3, 4):
@@ -358,7 +375,7 @@ def _kind_of(shape: tuple[int, ...]) -> str:
 
 
 def _floats(path: Path, array: np.ndarray, kind: str) -> np.ndarray:
-    """float32 with a channel axis; tables of more than two axes as rows of the last two."""
+    """Return the array as float32 with a channel axis; tables of more than two axes become rows of the last two."""
     if array.size == 0:
         raise InputError(f"{path} is not valid: it holds an array of {array.shape}, without a value")
     with np.errstate(over="ignore"):
@@ -371,16 +388,19 @@ def _floats(path: Path, array: np.ndarray, kind: str) -> np.ndarray:
     return found.reshape(-1, *found.shape[-2:]) if small else found.reshape(-1, found.shape[-1], 1)
 
 
-# ------------------------------------------------------------------------------------------------- what we stated
+# ------------------------------------------------------------------------------------------------- statements
 
 
 def _statement(path: Path) -> Statement | None:
-    """The manifest that lists this file: FILE.json beside a table; else that of a bake, STEM.json in this folder or the
-    one above, whose STEM the file's name begins with."""
+    """Return the statements of the manifest that lists the file, or None.
+
+    For a table that is FILE.json in the same folder. For a bake it is STEM.json in the same folder or the one above,
+    where the file's name begins with STEM.
+    """
     beside = path.with_name(path.name + ".json")
     found = _manifest(beside)
     if found is not None and found.get("name") == path.name:
-        return Statement(beside, _is(path, found), _told(found))
+        return Statement(beside, _matches(path, found), _without_files(found))
     stems = [path.name[:k] for k, c in enumerate(path.name) if c in "._-" and k]
     for folder in (path.parent.absolute().parent, path.parent.absolute()):
         for stem in reversed(stems):
@@ -393,19 +413,21 @@ def _statement(path: Path) -> Statement | None:
             if entry is not None:
                 own = {name: value for name, value in entry.items() if name not in ("sha256", "bytes")}
                 engine = relative.split("/")[0] if "/" in relative else None
-                told = {name: value for name, value in _told(found).items() if name != "levels"}  # of the whole bake
-                return Statement(manifest, _is(path, entry), {**told, **own, "engine": engine})
+                # The levels in `entry` are those of this file; the others describe the whole bake.
+                bake = {name: value for name, value in _without_files(found).items() if name != "levels"}
+                return Statement(manifest, _matches(path, entry), {**bake, **own, "engine": engine})
     return None
 
 
 def _manifest(path: Path) -> dict[str, Any] | None:
     try:
         return read_manifest(path)
-    except (FileError, ValueError):  # one that cannot be read proves nothing
+    except (FileError, ValueError):  # a manifest that cannot be read states nothing
         return None
 
 
 def _files(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Return the entries of all files that a manifest lists, by name."""
     found: dict[str, dict[str, Any]] = {}
     for part in (manifest.get("kept"), manifest.get("files")):
         if isinstance(part, dict):
@@ -413,14 +435,15 @@ def _files(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _is(path: Path, entry: Mapping[str, Any]) -> bool:
+def _matches(path: Path, entry: Mapping[str, Any]) -> bool:
+    """Return whether the file has the digest of its entry in a manifest."""
     try:
         return path.is_file() and digest_file(path) == entry.get("sha256")
     except (FileError, OSError, ValueError):
         return False
 
 
-def _told(manifest: Mapping[str, Any]) -> dict[str, Any]:
+def _without_files(manifest: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in manifest.items() if name not in ("files", "kept")}
 
 
@@ -437,7 +460,7 @@ def _sh_text(text: str) -> np.ndarray | None:
 
 
 def _sh(given: Any) -> np.ndarray | None:
-    """(9, 3) numbers, or None."""
+    """Convert a value to (9, 3) numbers; None where it has another form."""
     try:
         values = np.array(given, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -446,27 +469,28 @@ def _sh(given: Any) -> np.ndarray | None:
 
 
 def _value(text: str) -> Any:
-    """What a text says as JSON, else the text."""
+    """Parse a text as JSON; return the text itself where it is not JSON."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
         return text
 
 
-def _parsed(told: Mapping[str, Any]) -> dict[str, Any]:
-    """The recipe, which attributes hold as JSON."""
+def _parsed(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Parse the recipe, which attributes hold as JSON; an empty dict where there is none."""
     try:
-        return {"recipe": json.loads(told["recipe"])} if isinstance(told.get("recipe"), str) else {}
+        return {"recipe": json.loads(attributes["recipe"])} if isinstance(attributes.get("recipe"), str) else {}
     except (ValueError, RecursionError):
         return {}
 
 
 def _figures(row: Mapping[str, Any]) -> dict[str, float]:
-    return {name: number for name in FIGURES if (number := _number(row.get(name))) is not None}
+    """Return the numbers of FIGURES that a row of a manifest states."""
+    return {name: number for name in FIGURES if (number := _stated_number(row.get(name))) is not None}
 
 
-def _number(value: Any) -> float | None:
-    """A number that a file tells, None for anything else."""
+def _stated_number(value: Any) -> float | None:
+    """Return a stated number as a float; None for any other value."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -475,22 +499,26 @@ def _number(value: Any) -> float | None:
         return None
 
 
-def _numbers(statement: Statement | None, *names: str, within: str = "") -> dict[str, float]:
-    told = dict(statement.told) if statement is not None else {}
-    if isinstance(told.get("stored"), Mapping):  # of `lut`: what the format of its values costs
-        told["format_worst"] = told["stored"].get("error")
-    row = told.get(within) if within else told
+def _stated_figures(statement: Statement | None, *names: str, within: str = "") -> dict[str, float]:
+    """Return those of the figures `names` that a statement, or its part `within`, has."""
+    stated = dict(statement.stated) if statement is not None else {}
+    if isinstance(stated.get("stored"), Mapping):  # written by `lut`: the error of the format of the values
+        stated["format_worst"] = stated["stored"].get("error")
+    row = stated.get(within) if within else stated
     return {name: value for name, value in _figures(row).items() if name in names} if isinstance(row, Mapping) else {}
 
 
-def _levels_told(statement: Statement | None) -> dict[int, Mapping[str, Any]]:
-    """The rows that a manifest has of this file's levels, by number."""
-    rows = statement.told.get("levels") if statement is not None else None
+def _stated_levels(statement: Statement | None) -> dict[int, Mapping[str, Any]]:
+    """Return the rows of a manifest for the levels of the file, by number."""
+    rows = statement.stated.get("levels") if statement is not None else None
     return {k: row for k, row in enumerate(rows) if isinstance(row, Mapping)} if isinstance(rows, list) else {}
 
 
 def _roughness_of(light: Light, statement: Statement | None, levels: Sequence[np.ndarray]) -> list[float | None]:
-    """Of each level: the numbers of a key `roughness`, else the manifest's where its levels are of these sizes."""
+    """Return the roughness of each level, or None.
+
+    It comes from the container, from a key `roughness`, or from a manifest whose levels have the same sizes.
+    """
     if light.roughness is not None:
         return list(light.roughness)
     for key, value in light.keys.items():
@@ -501,10 +529,10 @@ def _roughness_of(light: Light, statement: Statement | None, levels: Sequence[np
                 continue
             if len(numbers) == len(levels) and all(math.isfinite(r) for r in numbers):
                 return list(numbers)
-    rows = _levels_told(statement)
+    rows = _stated_levels(statement)
     if light.cube and len(rows) == len(levels) and all(row.get("size") == texels.shape[-3] for row, texels in
                                                        zip(rows.values(), levels, strict=True)):
-        return [_number(row.get("roughness")) for row in rows.values()]
+        return [_stated_number(row.get("roughness")) for row in rows.values()]
     return [None] * len(levels)
 
 
@@ -512,7 +540,7 @@ def _roughness_of(light: Light, statement: Statement | None, levels: Sequence[np
 
 
 def _light_sh(light: Light) -> np.ndarray | None:
-    """Radiance coefficients from whatever scale an engine has."""
+    """Return the radiance coefficients of a light, converted from the scale of its engine; None where it has none."""
     if light.polynomials is not None:
         return unscaled(np.asarray(light.polynomials, np.float64), "babylon")
     if light.irradiance_sh is not None:
@@ -529,9 +557,14 @@ def _light_sh(light: Light) -> np.ndarray | None:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Of a level's colour channels, those of finite values: `low` and `high`, `mean` by channel over the sphere (a
-    table's over its cells); counts of NaN, infinite and negative values and of those `at_limit` of the format; `alpha`
-    the range of a fourth channel that is not 1 everywhere."""
+    """Statistics of the colour channels of a level.
+
+    low, high                the smallest and the largest finite value
+    mean                     mean of the finite values of each channel, over the sphere, or over the cells of a table
+    nan, infinite, negative  counts of such values
+    at_limit                 count of values at the largest value of the pixel format
+    alpha                    range of a fourth channel that is not 1 everywhere
+    """
 
     low: float
     high: float
@@ -544,7 +577,7 @@ class Statistics:
 
 
 def statistics(found: Contents, level: Level) -> Statistics:
-    """What can be counted in a level."""
+    """Compute the statistics of a level."""
     texels = level.texels
     alpha = None
     if texels.shape[-1] == 4 and found.kind not in ("table", "arrays"):
@@ -571,6 +604,7 @@ def statistics(found: Contents, level: Level) -> Statistics:
 
 
 def _weights(found: Contents, level: Level) -> np.ndarray:
+    """Return the weights of the texels in means, which broadcast to them: solid angles, or 1 for a table."""
     if (found.cube or level is found.irradiance) and level.texels.ndim >= 4:
         return cube_solid_angles(level.size)
     if found.kind == "lat-long" and level is not found.dfg:
@@ -579,7 +613,7 @@ def _weights(found: Contents, level: Level) -> np.ndarray:
 
 
 def described(found: Contents) -> dict[str, Any]:
-    """All of it as plain data, for a row: what `statistics` and `looks_like` say too."""
+    """Return all facts about the contents as plain data, for a row of JSON, with `statistics` and `looks_like`."""
     parts = [*found.levels, *(part for part in (found.irradiance, found.dfg) if part is not None)]
     return {
         "event": "contents", "file": str(found.path), "kind": found.kind, "container": found.container,
@@ -588,7 +622,7 @@ def described(found: Contents) -> dict[str, Any]:
         **({} if found.sh is None else {"sh": found.sh.tolist()}),
         "keys": dict(found.keys), "looks_like": looks_like(found),
         "statement": None if found.statement is None else {
-            **found.statement.told,
+            **found.statement.stated,
             "manifest": None if found.statement.manifest is None else str(found.statement.manifest),
             "whole": found.statement.whole},
         "notices": list(found.notices),
@@ -606,11 +640,11 @@ def _row(found: Contents, level: Level) -> dict[str, Any]:
             "alpha": None if said.alpha is None else list(said.alpha), **level.stated}
 
 
-# ------------------------------------------------------------------------------------------------- whose is it
+# ------------------------------------------------------------------------------------------------- engines
 
 
 def looks_like(found: Contents) -> list[str]:
-    """Which engines' files it may be, as far as its own bytes tell: `ENGINE: what that file holds`."""
+    """List the engines whose files look like this one, judged by its bytes alone, as `ENGINE: use of the file`."""
     if not found.levels:
         return []
     said = [f"{engine.name}: {HOLDS[file.holds]}" for engine in ENGINES.values() for file in engine.file
@@ -621,7 +655,7 @@ def looks_like(found: Contents) -> list[str]:
 
 
 def _fits(found: Contents, engine: Engine, file: File) -> bool:
-    """Whether a file has the container, the pixel format, the shape and the packing of a preset's."""
+    """Return whether the contents have the container, pixel format, shape and packing of a preset's file."""
     if found.container != CONTAINERS.get(file.suffix) or found.format.split(" ")[0] != file.stored:
         return False
     if file.suffix == ".ktx2" and (file.zstd is not None) != (found.facts.get("supercompression") == "Zstandard"):
@@ -631,6 +665,6 @@ def _fits(found: Contents, engine: Engine, file: File) -> bool:
         return found.kind in ("table", "image") and found.levels[0].texels.shape[:2] == (engine.dfg.size,) * 2
     if file.holds in ("specular", "sheen"):
         chain = found.cube and many and (found.levels[-1].size == 1 or not engine.whole)
-        # Filament's loader wants its harmonics in the file.
+        # Filament's loader needs the harmonics in the file.
         return chain and ("sh" in found.keys or engine.sh != "filament")
     return found.cube and not many and file.holds in ("skybox", "irradiance")
