@@ -2,7 +2,6 @@
 against closed truths. What holds for every NDF is parametrised over the catalogue."""
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
@@ -15,7 +14,6 @@ from scipy import integrate, special
 
 import whitefurnace
 from whitefurnace.catalogue import Model, Parameter, models, roughness
-from whitefurnace.catalogue.bibliography import PAPERS
 from whitefurnace.errors import UsageError
 from whitefurnace.opencl.device import Device
 
@@ -209,10 +207,9 @@ def test_D_against_its_reference_over_the_domain(device, precision, name):
     # The largest D of each set of parameters: the last axes are the angles.
     inner = int(np.prod([len(d) for d in directions(entry)]))
     peak = np.repeat(wanted.reshape(-1, inner).max(1), inner)
-    stated = re.search(r"at most ([\d.]+e-\d+)", str(entry.facts.get("float32", "")))
     # 32: what the entry states, or 1e-5, which is what the rounding of an exponent of -16 (D = 1e-7 of its peak) and
     # of sin²θ in it may cost. 64: the same 5e8 times finer, and the reference's own error, as large again.
-    tolerance = (float(stated[1]) if stated else 1e-5) if precision == 32 else 6e-14
+    tolerance = (entry.checks.float32_error or 1e-5) if precision == 32 else 6e-14
     # Below 1e-7 of the peak the exponent grows, and with it its rounding.
     grows = {32: 8e-7, 64: 6e-14}[precision]
     for lanes in {1, device.lanes(precision)}:
@@ -299,7 +296,7 @@ def stretch_of(device: Device, entry: Model, parameters: Mapping[str, float]) ->
 @EVERY
 def test_references_are_normalized(device, name):
     entry = models("ndf")[name]
-    assert entry.facts["normalized"] is True
+    assert entry.checks.normalized is True
     for parameters in corners(name):
         # 2 800 nodes, each rounded, and D's own error: 1e-13.
         got = energy(entry, parameters, stretch=stretch_of(device, entry, parameters))
@@ -628,14 +625,6 @@ def test_conversions_are_inverses():
 def test_conversions_refuse_what_lies_outside(function, bad):
     with pytest.raises(UsageError, match="outside"):
         function(bad)
-
-
-@EVERY
-def test_entries_cite_papers_that_are_listed(name):
-    entry = models("ndf")[name]
-    assert entry.citation in PAPERS
-    for key in re.findall(r"\[([A-Z]\w+\d{4})", kernel_file(entry.kernel_file)):
-        assert key in PAPERS, f"{entry.kernel_file} cites {key}"
 
 
 def test_an_average_states_its_error_where_two_rules_err_alike(device: Device) -> None:

@@ -87,13 +87,13 @@ def exact(name: str, precision: int) -> float:
 def test_normalization(device: Device, name: str, precision: int) -> None:
     columns = domain(NDFS[name], False)
     got = integrate("normalization", ndf=name, precision=precision, device=device, **columns)
-    assert NDFS[name].facts["normalized"]
+    assert NDFS[name].checks.normalized
     assert_close(got.values, 1, exact(name, precision), columns, name)
     assert_close(got.values, 1, got.error, columns, f"{name}, stated error")
     assert got.evaluations > 0 and got.seconds > 0 and got.rule.split("-")[0] in ("polar", "stretched")
 
 
-FURNACE = [name for name, m in MASKINGS.items() if m.facts.get("weak furnace") == 1]
+FURNACE = [name for name, m in MASKINGS.items() if m.checks.weak_furnace == 1]
 
 
 @PRECISIONS
@@ -239,11 +239,11 @@ def check_quadrature(device: Device, name: str, masking: str, at_least: float, f
     if masking == "smith":
         assert_close(got.values, want, 1e-5, columns, context)
     # At n·v = 1e-4 a kink may hide from three rules in a row: Cook and Torrance's does, by 2.2 times the statement.
-    stated = got.error * np.where((columns["NoV"] < 1e-3) & ("slow rules" in MASKINGS[masking].facts), 3, 1)
+    stated = got.error * np.where((columns["NoV"] < 1e-3) & (MASKINGS[masking].checks.slow_rules is not None), 3, 1)
     assert_close(got.values, want, stated + doubt, columns, f"{context}, stated error")
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", [n for n in ISOTROPIC if n != "ggx"])
 def test_albedo_with_smith(device: Device, name: str) -> None:
     check_quadrature(device, name, "smith", 30)
@@ -255,7 +255,7 @@ def test_albedo_with_every_masking(device: Device, name: str, masking: str) -> N
     check_quadrature(device, name, masking, 3)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("masking", MASKINGS)
 @pytest.mark.parametrize("name", ANISOTROPIC)
 def test_albedo_of_anisotropic_ndfs(device: Device, name: str, masking: str) -> None:
@@ -320,7 +320,7 @@ def test_the_stated_error_is_not_less_than_the_true_one(device: Device, name: st
     assert got.error <= tolerance + 4e-6, (name, tolerance, got.rule, got.error)  # + rounding of values up to 2
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", NDFS)
 def test_one_cell_alone_states_its_error(device: Device, name: str) -> None:
     """A cell alone climbs by itself, and may meet two rules that err alike."""

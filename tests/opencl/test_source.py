@@ -1,4 +1,4 @@
-"""Assembled kernel text: the table of programs and of functions is what the kernel files have, and constants of the host
+"""Assembled kernel text: the tables of programs and of functions agree with the kernel files, and constants of the host
 reach the text."""
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ def test_a_wrong_reference(device: Device) -> None:
 
 def test_a_wrong_area_breaks_the_furnace(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     masking = model("masking", "schlick_smith")
-    boast = dataclasses.replace(masking, facts={**masking.facts, "weak furnace": 1.0})
+    boast = dataclasses.replace(masking, checks=dataclasses.replace(masking.checks, weak_furnace=1.0))
     bad = failed(rows_of(boast, device))
     assert "weak furnace with beckmann" in bad
     where = bad["weak furnace with beckmann"].counterexample
@@ -214,11 +214,11 @@ def test_a_broken_kernel(device: Device, slot: str, name: str, text: str, checks
         assert all(abs(np.linalg.norm(where[d]) - 1) < 1e-6 and where[d][2] >= 0 for d in "lv")
 
 
-@pytest.mark.parametrize("facts, check", [({"reciprocal": False}, "not reciprocal, as declared"),
-                                          ({"largest albedo": 0.9}, "energy: albedo as declared")])
-def test_a_false_declaration(device: Device, facts: dict[str, Any], check: str) -> None:
+@pytest.mark.parametrize("stated, check", [({"reciprocal": False}, "not reciprocal, as declared"),
+                                          ({"largest_albedo": 0.9}, "energy: albedo as declared")])
+def test_a_false_declaration(device: Device, stated: dict[str, Any], check: str) -> None:
     lambert = model("diffuse", "lambert")
-    bad = failed(rows_of(dataclasses.replace(lambert, facts={**lambert.facts, **facts}), device))
+    bad = failed(rows_of(dataclasses.replace(lambert, checks=dataclasses.replace(lambert.checks, **stated)), device))
     assert set(bad) == {check}
 
 

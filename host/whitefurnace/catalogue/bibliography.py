@@ -1,9 +1,14 @@
-"""The papers that entries and kernels cite, by key."""
+"""The bibliography: every paper that kernels, catalogue entries and the engine cite, by key.
 
-PAPERS = {
-    "Bagher2012": "M. Bagher, C. Soler, N. Holzschuch, Accurate Fitting of Measured Reflectances Using a Shifted Gamma "
-                  "Micro-facet Distribution, CGF 31(4), 2012",
-    "BornWolf1999": "M. Born, E. Wolf, Principles of Optics, 7th edition, Cambridge University Press, 1999",
+An entry of the catalogue brings the paper that it is from (`citation=Paper(…)`). Papers that belong to no single entry,
+since several cite them or the engine does, are listed here; an entry takes one of these with `cited`.
+"""
+from __future__ import annotations
+
+from whitefurnace.catalogue.model import Paper
+from whitefurnace.catalogue.registry import SLOTS, models
+
+SHARED = {
     "Bruneton2008": "E. Bruneton, F. Neyret, Precomputed Atmospheric Scattering, CGF 27(4), 2008",
     "Burley2012": "B. Burley, Physically Based Shading at Disney, SIGGRAPH 2012 course",
     "CIE15": "Commission Internationale de l'Éclairage, Colorimetry, 4th edition, CIE 015:2018",
@@ -11,11 +16,9 @@ PAPERS = {
                              "Scattering, Pixar Technical Memo 15-04, 2015",
     "Clenshaw1955": "C. Clenshaw, A Note on the Summation of Chebyshev Series, MTAC 9(51), 1955",
     "Colbert2007": "M. Colbert, J. Křivánek, GPU-Based Importance Sampling, GPU Gems 3, chapter 20, 2007",
-    "CookTorrance1982": "R. Cook, K. Torrance, A Reflectance Model for Computer Graphics, ACM TOG 1(1), 1982",
     "dEonLuebke2007": "E. d'Eon, D. Luebke, Advanced Techniques for Realistic Real-Time Skin Rendering, GPU Gems 3, "
                       "chapter 14, 2007",
     "Dupuy2023": "J. Dupuy, A. Benyoub, Sampling Visible GGX Normals with Spherical Caps, CGF 42(8), 2023",
-    "Estevez2017": "A. C. Estevez, C. Kulla, Production Friendly Microfacet Sheen BRDF, SIGGRAPH 2017 course",
     "FdezAguera2019": "C. J. Fdez-Agüera, A Multiple-Scattering Microfacet Model for Real-Time Image-Based Lighting, "
                       "JCGT 8(1), 2019",
     "Frisvad2012": "J. R. Frisvad, Building an Orthonormal Basis from a 3D Unit Vector Without Normalization, Journal "
@@ -33,37 +36,30 @@ PAPERS = {
     "Kahan1965": "W. Kahan, Further Remarks on Reducing Truncation Errors, Communications of the ACM 8(1), 1965",
     "Karis2013": "B. Karis, Real Shading in Unreal Engine 4, SIGGRAPH 2013 course",
     "Karis2014": "B. Karis, Physically Based Shading on Mobile, Unreal Engine blog, 2014",
-    "Kelemen2001": "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with Importance "
-                   "Sampling, Eurographics short presentations, 2001",
     "Krivanek2008": "J. Křivánek, M. Colbert, Real-Time Shading with Filtered Importance Sampling, CGF 27(4), 2008",
     "KullaConty2017": "C. Kulla, A. Conty, Revisiting Physically Based Shading at Imageworks, SIGGRAPH 2017 course",
-    "Kutz2021": "P. Kutz, M. Hašan, E. Edmondson, Novel Aspects of the Adobe Standard Material, Adobe, 2021",
     "Lagarde2014": "S. Lagarde, C. de Rousiers, Moving Frostbite to Physically Based Rendering, SIGGRAPH 2014 course",
     "Lawson1961": "C. L. Lawson, Contributions to the Theory of Linear Least Maximum Approximation, PhD thesis, UCLA, "
                   "1961",
-    "Low2012": "J. Löw et al., BRDF Models for Accurate and Efficient Rendering of Glossy Surfaces, ACM TOG 31(1), "
-               "2012",
     "Mahy1994": "M. Mahy, L. Van Eycken, A. Oosterlinck, Evaluation of Uniform Color Spaces Developed after the "
                 "Adoption of CIELAB and CIELUV, Color Research and Application 19(2), 1994",
     "Marquardt1963": "D. W. Marquardt, An Algorithm for Least-Squares Estimation of Nonlinear Parameters, SIAM J. "
                      "Appl. Math. 11(2), 1963",
     "McCalpin1995": "J. McCalpin, Memory Bandwidth and Machine Balance in Current High Performance Computers, IEEE "
                     "TCCA Newsletter, 1995",
-    "Minnaert1941": "M. Minnaert, The Reciprocity Principle in Lunar Photometry, Astrophysical Journal 93, 1941",
     "Narkowicz2015": "K. Narkowicz, ACES Filmic Tone Mapping Curve, 2015",
-    "Neumann1999": "L. Neumann, A. Neumann, L. Szirmay-Kalos, Compact Metallic Reflectance Models, CGF 18(3), 1999",
     "OrenNayar1994": "M. Oren, S. Nayar, Generalization of Lambert's Reflectance Model, SIGGRAPH 1994",
     "Penner2011": "E. Penner, G. Borshukov, Pre-Integrated Skin Shading, GPU Pro 2, 2011",
     "PopeFry1997": "R. M. Pope, E. S. Fry, Absorption Spectrum (380-700 nm) of Pure Water. II. Integrating Cavity "
                    "Measurements, Applied Optics 36(33), 1997",
-    "Portsmouth2025": "J. Portsmouth, P. Kutz, S. Hill, EON: A Practical Energy-Preserving Rough Diffuse BRDF, "
-                      "JCGT 14(1), 2025",
+    "Praun2003": "E. Praun, H. Hoppe, Spherical Parametrization and Remeshing, ACM TOG 22(3), 2003",
     "Ramamoorthi2001": "R. Ramamoorthi, P. Hanrahan, An Efficient Representation for Irradiance Environment Maps, "
                        "SIGGRAPH 2001",
     "Reinhard2002": "E. Reinhard, M. Stark, P. Shirley, J. Ferwerda, Photographic Tone Reproduction for Digital Images,"
                     " ACM TOG 21(3), 2002",
     "Schlick1994": "C. Schlick, An Inexpensive BRDF Model for Physically-Based Rendering, CGF 13(3), 1994",
     "Shirley1997": "P. Shirley et al., A Practitioners' Assessment of Light Reflection Models, Pacific Graphics 1997",
+    "Sloan2017": "P.-P. Sloan, Deringing Spherical Harmonics, SIGGRAPH Asia technical briefs, 2017",
     "Snyder1996": "J. Snyder, Area Light Sources for Real-Time Graphics, Microsoft Research MSR-TR-96-11, 1996",
     "Turquin2019": "E. Turquin, Practical Multiple Scattering Compensation for Microfacet Models, Industrial Light & "
                    "Magic, 2019",
@@ -74,4 +70,20 @@ PAPERS = {
                 "81(278), 2012",
     "Weiszfeld1937": "E. Weiszfeld, Sur le point pour lequel la somme des distances de n points donnés est minimum, "
                      "Tôhoku Mathematical Journal 43, 1937",
+    "WilsonHilferty1931": "E. B. Wilson, M. M. Hilferty, The Distribution of Chi-Square, PNAS 17(12), 1931",
 }
+"""Papers by key that belong to no single entry."""
+
+
+def cited(key: str) -> Paper:
+    """Return the shared paper `key`, for an entry. Raises KeyError where the list has none."""
+    return Paper(key, SHARED[key])
+
+
+def bibliography() -> dict[str, Paper]:
+    """Return all papers by key, in alphabetical order: the shared ones and those that entries bring."""
+    found = {key: Paper(key, text) for key, text in SHARED.items()}
+    for slot in SLOTS:
+        for entry in models(slot).values():
+            found |= {paper.key: paper for paper in (entry.citation, *entry.also_cited)}
+    return dict(sorted(found.items(), key=lambda item: item[0].lower()))

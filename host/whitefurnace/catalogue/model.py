@@ -1,4 +1,4 @@
-"""What a catalogue entry says of a model, a parameter, an integral."""
+"""The form of catalogue entries: models with their parameters, checks and papers, and integrals."""
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -12,7 +12,12 @@ from whitefurnace.errors import UsageError
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a model: its domain validates input, its typical values feed tests and help."""
+    """One parameter of a model.
+
+    name, symbol, unit: as command lines, formulas and tables write it. low, high: its domain, inclusive, which input is
+    held to. typical: values that tests and help show. about: what it is, in one line. default: its value where none is
+    given; None where one must be given or follows from roughness.
+    """
 
     name: str
     symbol: str
@@ -24,7 +29,10 @@ class Parameter:
     default: float | None = None
 
     def check(self, values: Any, where: str) -> np.ndarray:
-        """`values` as float64, or UsageError when one lies outside [low, high] or is not finite."""
+        """Return `values` as float64.
+
+        Raises UsageError where one is no number, is not finite or lies outside [low, high]; `where` begins the message.
+        """
         try:
             array = np.asarray(values, np.float64)
         except (TypeError, ValueError):
@@ -37,31 +45,83 @@ class Parameter:
 
 
 @dataclass(frozen=True)
-class Model:
-    """One model of a slot. `provides` and `needs` name kernel functions as SLOT_FUNCTION (`NDF_D`).
+class Paper:
+    """A publication: the key that comments cite (`Walter2007`) and its full citation."""
 
-    `constants` gives float64 numbers that follow from the parameters alone, such as a norm; kernel functions take
-    them, in the order of `constant_names`, after the parameters. `presets` are named parameter sets, RGB as three.
-    `limits` are exact values by name: each takes the parameters and gives the argument of the reference and its value,
-    NaN where there is none.
-    `text` is the kernel text of a model from a user's file, `path` where it lies and `takes_sin2` whether its D wants
-    sin²θ; a model of ours has a kernel file.
+    key: str
+    text: str
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What an entry states for the engine and the tests to act on. None means that nothing is stated.
+
+    normalized: whether ∫ D(m)(n·m) dω is 1.
+    reciprocal: whether the model stays the same when l and v are exchanged.
+    slow_rules: by how many times its change from the rule before a quadrature rule may err; over 1 where the integrand
+      has kinks or roots that rules resolve slowly.
+    weak_furnace: value of the weak furnace test with every NDF, for a masking.
+    tolerance: tolerances (float32, float64) of single checks of `whitefurnace verify`, by the name of the check.
+    largest_albedo: the largest directional albedo for parameters in their domain, infinity for no bound.
+    float32_error: the largest relative error of D in float32 where D is over 1e-7 of its peak.
+    negative: whether the BRDF has negative values somewhere.
+    leaves_unit_range: whether the Fresnel term leaves [0, 1] somewhere.
+    """
+
+    normalized: bool | None = None
+    reciprocal: bool | None = None
+    slow_rules: float | None = None
+    weak_furnace: float | None = None
+    tolerance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    largest_albedo: float | None = None
+    float32_error: float | None = None
+    negative: bool = False
+    leaves_unit_range: bool = False
+
+
+_LISTED = {
+    "normalized": (), "reciprocal": (), "slow rules": ("float32", "follows roughness"),
+    "weak furnace": ("follows roughness",), "tolerance": ("float32", "energy"), "largest albedo": ("energy",),
+}
+"""The checks that a listing of a model shows, each after the first of these notes that the model has, or at the top."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model of a slot: all that the engine, the tests and the documents know about it.
+
+    slot, name, title: where it belongs, its name on command lines, its name for people.
+    citation: the paper that it is from. `also_cited` are further papers that its kernel file cites.
+    parameters: its parameters, in the order in which kernel functions take them.
+    provides, needs: kernel functions that it has and that it calls on other slots, as SLOT_FUNCTION (`NDF_D`).
+    reference: float64 references by function name, written in another form than the kernel.
+    isotropic: whether an NDF depends on the polar angle alone.
+    from_roughness: its parameters for a perceptual roughness in [0, 1], in a chain of levels.
+    past_one: the same for roughnesses over 1, which the last mips of some engines have; None where r = 1 is the end.
+    checks: what the engine and the tests act on. notes: further facts, in prose, for readers alone.
+    constants: gives float64 numbers that follow from the parameters alone, such as a norm; kernel functions take them,
+      in the order of `constant_names`, after the parameters.
+    presets: named parameter sets, RGB as three numbers.
+    limits: exact values by name. Each takes the parameters and returns the argument of the reference and its value
+      there, NaN where there is none.
+    text, path, takes_sin2: of a model from a user's file, its kernel text, where the file lies, and whether its D takes
+      sin²θ. Models of the catalogue have a kernel file instead.
     """
 
     slot: str
     name: str
     title: str
-    citation: str
+    citation: Paper
     parameters: tuple[Parameter, ...]
     provides: tuple[str, ...]
     reference: Mapping[str, Callable[..., Any]]
-    """Float64 references by function name, written in another form than the kernel."""
     needs: tuple[str, ...] = ()
     isotropic: bool = True
     from_roughness: Callable[[float], dict[str, float]] | None = None
     past_one: Callable[[float], dict[str, float]] | None = None
-    """The same for roughnesses over 1, which some engines' last mips have; None where r = 1 is the end."""
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    checks: Checks = Checks()
+    notes: Mapping[str, str | bool] = field(default_factory=dict)
+    also_cited: tuple[Paper, ...] = ()
     constants: Callable[..., dict[str, np.ndarray]] | None = None
     constant_names: tuple[str, ...] = ()
     presets: Mapping[str, Mapping[str, float | tuple[float, float, float]]] = field(default_factory=dict)
@@ -72,23 +132,43 @@ class Model:
 
     @property
     def kernel_file(self) -> str:
+        """The kernel file of a model of the catalogue, relative to the folder of kernels."""
         return f"{self.slot}/{self.name}.clh"
 
     @property
+    def facts(self) -> dict[str, Any]:
+        """What the entry states, for listings: its notes, and those of its checks that `_LISTED` names."""
+        after: dict[str | None, dict[str, Any]] = {}
+        for name, places in _LISTED.items():
+            value = getattr(self.checks, name.replace(" ", "_"))
+            if value is not None and value != {}:
+                after.setdefault(next((note for note in places if note in self.notes), None), {})[name] = value
+        shown = after.get(None, {})
+        for note, value in self.notes.items():
+            shown |= {note: value, **after.get(note, {})}
+        return shown
+
+    @property
     def arguments(self) -> tuple[str, ...]:
-        """Names of the numbers a kernel function takes after its own: parameters, then constants."""
+        """Names of the numbers that a kernel function takes after its own: parameters, then constants."""
         return (*(p.name for p in self.parameters), *self.constant_names)
 
     def passed(self, function: str) -> tuple[str, ...]:
-        """Those of `arguments` that a kernel function of a self-contained model takes: constants go to D and its
-        sampler alone, and a user's file knows none."""
+        """Return those of `arguments` that a kernel function of a self-contained model takes.
+
+        Constants go to D, its sampler and the diffuse f alone, and functions of a user's file take none.
+        """
         wanted = self.text is None and function in ("NDF_D", "NDF_SAMPLE", "DIFFUSE_F")
         return self.arguments if wanted else tuple(p.name for p in self.parameters)
 
 
 @dataclass(frozen=True)
 class Integral:
-    """An integral of the catalogue: `integrand/NAME.clh` under the rule that fits its `support` (`ring.clh`)."""
+    """An integral of the catalogue, whose integrand is the kernel file `integrand/NAME.clh`.
+
+    components: numbers of its value. needs: the model functions that it calls. support: the rule that it is summed by,
+    a macro of `ring.clh`. view: whether it depends on the view. about: its formula, for help texts.
+    """
 
     name: str
     title: str

@@ -4,7 +4,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.model import Model, Paper, Parameter
 from whitefurnace.errors import FileError, InputError, UsageError
 
 FORMS = {
@@ -63,7 +63,7 @@ def user_model(slot: str, path: str | Path) -> Model:
         slot=slot,
         name=path.stem,
         title=f"from {path.name}",
-        citation="",
+        citation=Paper("", ""),
         parameters=tuple(Parameter(p, p, "", -1e30, 1e30, (), f"of {path.name}") for _, p in rest),
         provides=("NDF_D",) if slot == "ndf" else ("BRDF_F",),
         reference={},

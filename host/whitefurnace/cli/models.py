@@ -42,7 +42,7 @@ def models(name: str | None, as_json: bool) -> None:
 
 def models_text(entries: Sequence[Model]) -> str:
     """The table of the catalogue."""
-    rows = [[e.slot, e.name, e.title, ", ".join(_domains(e)), e.citation] for e in entries]
+    rows = [[e.slot, e.name, e.title, ", ".join(_domains(e)), e.citation.key] for e in entries]
     return table(["slot", "name", "title", "parameters", "source"], rows, left=5)
 
 
@@ -60,9 +60,7 @@ def _domains(entry: Model) -> list[str]:
 
 def model_text(entry: Model) -> str:
     """The text of one model: everything that its entry states."""
-    from whitefurnace.catalogue.bibliography import PAPERS
-
-    lines = [f"{entry.slot} {entry.name}: {entry.title}", f"  source      {PAPERS.get(entry.citation, entry.citation)}"]
+    lines = [f"{entry.slot} {entry.name}: {entry.title}", f"  source      {entry.citation.text}"]
     rows = [[p.name, p.symbol, f"[{p.low:g}, {p.high:g}]", "" if p.default is None else f"{p.default:g}",
              ", ".join(f"{v:g}" for v in p.typical), p.about] for p in entry.parameters]
     if rows:
@@ -79,7 +77,7 @@ def model_text(entry: Model) -> str:
 
 def model_rows(entries: Sequence[Model]) -> list[dict[str, Any]]:
     """JSON rows of the catalogue."""
-    return [{"slot": e.slot, "name": e.name, "title": e.title, "citation": e.citation,
+    return [{"slot": e.slot, "name": e.name, "title": e.title, "citation": e.citation.key,
              "parameters": [{"name": p.name, "symbol": p.symbol, "unit": p.unit, "domain": [p.low, p.high],
                              "typical": list(p.typical), "about": p.about} for p in e.parameters],
              "presets": {name: dict(values) for name, values in e.presets.items()},

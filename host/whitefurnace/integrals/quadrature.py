@@ -430,7 +430,7 @@ def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precis
     totals.used(ladder[first], part.lanes(cells))
     active = np.arange(n)
     change = np.empty(0)
-    slow = max(m.facts.get("slow rules", 1.0) for m in part.slots.values())
+    slow = max(m.checks.slow_rules or 1.0 for m in part.slots.values())
     before = np.where(np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) < BLOCK, np.inf, 0.0)
     for rule in ladder[first + 1:]:
         fine = part.sum(cells[:, active], terms, rule, precision).astype(np.float64)

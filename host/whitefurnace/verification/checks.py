@@ -217,7 +217,7 @@ class Bench:
 
     def tolerance(self, check: str, usual: Mapping[int, float]) -> float:
         """The tolerance of a check: as usual, unless the entry's `tolerance` has one for float32 and float64."""
-        declared = self.model.facts.get("tolerance", {}).get(check)
+        declared = self.model.checks.tolerance.get(check)
         return float(usual[self.precision] if declared is None else declared[PRECISIONS.index(self.precision)])
 
     def rounded(self, values: Any) -> Any:
@@ -354,7 +354,7 @@ def _views(b: Bench) -> dict[str, Any]:
 
 def _smith() -> list[Model]:
     """The maskings that declare the weak furnace with any NDF, the engine's default first."""
-    return [m for m in models("masking").values() if "weak furnace" in m.facts]
+    return [m for m in models("masking").values() if m.checks.weak_furnace is not None]
 
 
 def _weak_furnace(b: Bench) -> Iterator[Row]:
@@ -363,7 +363,7 @@ def _weak_furnace(b: Bench) -> Iterator[Row]:
     masking = _smith()[0]
     values, _, note = b.integral("weak_furnace", RULE[b.precision], masking=masking, **views, **columns)
     where = {**views, **columns, "v": _direction(views["NoV"], views.get("phi", 0.0))}
-    yield b.row(f"weak furnace, {masking.name}", values, masking.facts["weak furnace"],
+    yield b.row(f"weak furnace, {masking.name}", values, masking.checks.weak_furnace,
                 b.tolerance("weak furnace", INTEGRAL), where, note=note)
 
 
@@ -489,7 +489,7 @@ def _chi2(b: Bench) -> Iterator[Row]:
         o, e = np.append(seen[fit], seen[~fit].sum()), np.append(expected[fit], expected[~fit].sum())
         o, e = (o, e) if e[-1] >= 5 else (np.append(o[:-2], o[-2] + o[-1]), np.append(e[:-2], e[-2] + e[-1]))
         found[k], freedom[k] = float(((o - e) ** 2 / e).sum()), e.size - 1
-        # [Wilson and Hilferty 1931]: the cube root of χ²/k is nearly normal; the level is met to a few percent.
+        # [WilsonHilferty1931]: the cube root of χ²/k is nearly normal; the level is met to a few percent.
         spread = 2 / (9 * freedom[k])
         critical[k] = freedom[k] * (1 - spread + level * math.sqrt(spread)) ** 3
     yield b.row("sampler, chi²", found, freedom, critical - freedom, columns, bound="most",
@@ -569,7 +569,7 @@ def _kernel_masking(b: Bench) -> Iterator[Row]:
 def _reciprocity(b: Bench, one: np.ndarray, other: np.ndarray, tolerance: Any, where: Mapping[str, Any],
                  scale: Any) -> Row:
     """Equal under exchange of l and v where the entry says so; where it denies it, a difference must be seen."""
-    if b.model.facts.get("reciprocal", True):
+    if b.model.checks.reciprocal is not False:
         return b.row("reciprocity", one, other, tolerance, where)
     apart = np.abs(one - other) / scale
     k = int(np.nanargmax(apart))
@@ -581,7 +581,7 @@ def _reciprocity(b: Bench, one: np.ndarray, other: np.ndarray, tolerance: Any, w
 def _furnace_of_masking(b: Bench) -> Iterator[Row]:
     if "MASKING_G1" not in b.model.provides:
         return
-    declared = b.model.facts.get("weak furnace")
+    declared = b.model.checks.weak_furnace
     for ndf in models("ndf").values():
         own = {p.name: p for p in b.model.parameters}
         # A masking with a parameter of the NDF's name follows it; any other is held at its middle value.
@@ -617,7 +617,7 @@ def _kernel_F(b: Bench) -> Iterator[Row]:
     got = b.kernel("FRESNEL_F", [cosine], own)[0]
     where = {"cos_d": cosine, **own}
     yield b.row("kernel F", got, want, 2 * RELATIVE[b.precision] + 2 * unsure, where)
-    if "range" not in b.model.facts:
+    if not b.model.checks.leaves_unit_range:
         yield b.row("F at least 0", got, 0.0, RELATIVE[b.precision], where, bound="least")
         yield b.row("F at most 1", got, 1.0, RELATIVE[b.precision], where, bound="most")
     else:
@@ -667,7 +667,7 @@ def _kernel_f(b: Bench) -> Iterator[Row]:
     swapped = b.kernel("DIFFUSE_F", [*v.T, *light.T], own)[0]
     yield _reciprocity(b, got, swapped, RELATIVE[b.precision] * (np.abs(got) + 1 / math.pi) + 4 * unsure, where,
                        scale=np.maximum(np.abs(got), 1e-30))
-    if "negative" in b.model.facts:
+    if b.model.checks.negative:
         yield b.measured("least f", got, own, least=True, note="declared")
     else:
         yield b.row("f at least 0", got, 0.0, 0.0, where, bound="least")
@@ -687,9 +687,9 @@ def _albedo(b: Bench) -> Iterator[Row]:
         infinite = ~finite & np.isinf(values)
         yield b.row("albedo", np.where(infinite, 0.0, values), np.where(infinite, 0.0, want),
                     b.tolerance("albedo", INTEGRAL) * np.where(infinite, 1.0, size), where, note=note)
-    if b.model.facts.get("energy") == "conserving":
+    largest = math.inf if b.model.checks.largest_albedo is None else b.model.checks.largest_albedo
+    if largest <= 1:
         yield b.row("energy: albedo", values, 1.0, INTEGRAL[b.precision], where, bound="most", note=note)
-    largest = b.model.facts.get("largest albedo", math.inf)
     if math.isfinite(largest):
         # A declared figure is rounded to its fourth decimal.
         yield b.row("energy: albedo as declared", values, largest, 6e-5, where, bound="most", note=note)

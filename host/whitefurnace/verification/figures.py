@@ -220,7 +220,7 @@ def _symbol(parameter: Parameter) -> str:
 def _heading(sheet: _Sheet, rows: Sequence[Row]) -> None:
     figure, entry = sheet.figure, sheet.entry
     failed = sorted({row.check for row in rows if not row.passed})
-    said = [SLOT_TITLES[entry.slot], f"[{entry.citation}]" if entry.citation else "",
+    said = [SLOT_TITLES[entry.slot], f"[{entry.citation.key}]" if entry.citation.key else "",
             f"float32 on {sheet.device.identity()['name']}"]
     if rows:
         said.append(f"{sum(row.passed for row in rows)} of {len(rows)} checks passed"

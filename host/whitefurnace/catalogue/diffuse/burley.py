@@ -1,7 +1,8 @@
 """Burley's diffuse of Disney's principled BRDF."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(light, view, albedo, roughness):
@@ -28,7 +29,7 @@ ENTRY = Model(
     slot="diffuse",
     name="burley",
     title="Burley (Disney)",
-    citation="Burley2012",
+    citation=cited("Burley2012"),
     parameters=(
         Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0), "base color"),
         Parameter("roughness", "r", "1", 0.0, 1.0, (0.0, 0.25, 0.5, 1.0), "perceptual roughness"),
@@ -36,7 +37,6 @@ ENTRY = Model(
     provides=("DIFFUSE_F",),
     reference={"f": _f, "albedo": _albedo},
     from_roughness=lambda r: {"roughness": r},
-    facts={"reciprocal": True,
-           "energy": "at most 785/504 = 1.5576 at NoV = 0 (albedo 1, roughness 1); above 1 from roughness .40 on",
-           "largest albedo": 785 / 504},
+    checks=Checks(reciprocal=True, largest_albedo=785 / 504),
+    notes={"energy": "at most 785/504 = 1.5576 at NoV = 0 (albedo 1, roughness 1); above 1 from roughness .40 on"},
 )

@@ -1,7 +1,7 @@
 """EON, the energy-preserving Oren-Nayar."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
 
 _C1, _C2 = 0.5 - 2 / (3 * np.pi), 2 / 3 - 28 / (15 * np.pi)
 
@@ -42,7 +42,9 @@ ENTRY = Model(
     slot="diffuse",
     name="eon",
     title="Energy-preserving Oren-Nayar (EON)",
-    citation="Portsmouth2025",
+    citation=Paper("Portsmouth2025",
+                   "J. Portsmouth, P. Kutz, S. Hill, EON: A Practical Energy-Preserving Rough Diffuse BRDF, JCGT "
+                   "14(1), 2025"),
     parameters=(
         Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0),
                   "albedo of a single scattering; that of the surface is a little less, but 1 for 1"),
@@ -50,5 +52,6 @@ ENTRY = Model(
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f, "albedo": _albedo},
-    facts={"reciprocal": True, "energy": "conserving", "largest albedo": 1.0},
+    checks=Checks(reciprocal=True, largest_albedo=1.0),
+    notes={"energy": "conserving"},
 )

@@ -1,7 +1,8 @@
 """Lambert's diffuse."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(light, view, albedo):
@@ -12,9 +13,10 @@ ENTRY = Model(
     slot="diffuse",
     name="lambert",
     title="Lambert",
-    citation="Hoffman2012",
+    citation=cited("Hoffman2012"),
     parameters=(Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0), "fraction of light reflected"),),
     provides=("DIFFUSE_F",),
     reference={"f": _f, "albedo": lambda NoV, albedo: np.asarray(albedo, np.float64) * np.ones_like(NoV)},
-    facts={"reciprocal": True, "energy": "conserving", "largest albedo": 1.0},
+    checks=Checks(reciprocal=True, largest_albedo=1.0),
+    notes={"energy": "conserving"},
 )

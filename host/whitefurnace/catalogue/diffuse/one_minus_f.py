@@ -1,7 +1,8 @@
 """Lambert times what Schlick's Fresnel leaves at n·l: the plain form."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(light, view, albedo, f0):
@@ -18,12 +19,13 @@ ENTRY = Model(
     slot="diffuse",
     name="one_minus_f",
     title="Lambert × (1 - F), plain",
-    citation="Hoffman2012",
+    citation=cited("Hoffman2012"),
     parameters=(
         Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0), "fraction reflected of the light that enters"),
         Parameter("f0", "F0", "1", 0.0, 1.0, (0.02, 0.04, 0.17), "reflectance of the surface at normal incidence"),
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f, "albedo": _albedo},
-    facts={"reciprocal": False, "energy": "conserving", "largest albedo": 20 / 21},
+    checks=Checks(reciprocal=False, largest_albedo=20 / 21),
+    notes={"energy": "conserving"},
 )

@@ -1,7 +1,8 @@
 """Oren and Nayar's two-coefficient model."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(light, view, albedo, sigma):
@@ -17,7 +18,7 @@ ENTRY = Model(
     slot="diffuse",
     name="oren_nayar_qualitative",
     title="Oren-Nayar, qualitative",
-    citation="OrenNayar1994",
+    citation=cited("OrenNayar1994"),
     parameters=(
         Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0), "albedo of the facets"),
         Parameter("sigma", "σ", "rad", 0.0, np.pi / 2, (0.0, 0.1, 0.35, 0.8, 1.57),
@@ -25,8 +26,7 @@ ENTRY = Model(
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f},
-    facts={"reciprocal": True,
-           "energy": "at most 1.0152 at NoV = 0 (albedo 1, σ = .199); above 1 for σ < .33, NoV < .3",
-           "tolerance": {"kernel f": (5e-7, 2e-12)},  # the reference's tangents of angles near π/2
-           "largest albedo": 1.0152},
+    # The tolerance is for the reference's tangents of angles near π/2.
+    checks=Checks(reciprocal=True, tolerance={"kernel f": (5e-7, 2e-12)}, largest_albedo=1.0152),
+    notes={"energy": "at most 1.0152 at NoV = 0 (albedo 1, σ = .199); above 1 for σ < .33, NoV < .3"},
 )

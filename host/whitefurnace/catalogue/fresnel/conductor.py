@@ -1,7 +1,7 @@
 """Fresnel's equations for a metal."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.model import Model, Paper, Parameter
 
 
 def _f(cos_d, eta, kappa):
@@ -18,7 +18,8 @@ ENTRY = Model(
     slot="fresnel",
     name="conductor",
     title="Fresnel, conductor",
-    citation="BornWolf1999",
+    citation=Paper("BornWolf1999",
+                   "M. Born, E. Wolf, Principles of Optics, 7th edition, Cambridge University Press, 1999"),
     parameters=(
         Parameter("eta", "η", "1", 1e-3, 20.0, (0.05, 0.2, 1.0, 2.5, 10.0),
                   "real part of the metal's index over that of this side"),
@@ -36,7 +37,7 @@ ENTRY = Model(
         "total internal reflection": lambda eta, kappa: (np.sqrt(np.maximum(1 - eta**2, 0)) / 2, np.where(
             (kappa == 0) & (eta < 1), 1.0, np.nan)),
     },
-    facts={
+    notes={
         "at 0°": "((η - 1)² + κ²)/((η + 1)² + κ²)",
         "at 90°": "1, but 0 for η = 1, κ = 0",
         "float32": "absolute error ≤ 5e-7 everywhere",

@@ -1,7 +1,8 @@
 """Fresnel's equations between two insulators."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(cos_d, ior):
@@ -19,7 +20,7 @@ ENTRY = Model(
     slot="fresnel",
     name="dielectric",
     title="Fresnel, dielectric",
-    citation="Walter2007",
+    citation=cited("Walter2007"),
     parameters=(
         Parameter("ior", "n", "1", 0.2, 5.0, (0.4, 0.75, 1.0, 1.333, 1.5, 2.417, 5.0),
                   "index of the far side over that of this side; below 1 there is total internal reflection"),
@@ -35,12 +36,12 @@ ENTRY = Model(
         "total internal reflection": lambda ior: (np.sqrt(np.maximum(1 - ior**2, 0)) / 2,
                                                   np.where(ior < 1, 1.0, np.nan)),
     },
-    facts={
+    # The root at the critical angle of n < 1: rules gain less on one another than they are off.
+    checks=Checks(slow_rules=6.0),
+    notes={
         "at 0°": "((n - 1)/(n + 1))²",
         "at 90°": "1, but 0 for n = 1",
         "float32": "absolute error ≤ 6e-7 everywhere, the critical angle included",
-        # The root at the critical angle of n < 1: rules gain less on one another than they are off.
-        "slow rules": 6.0,
         "critical angle": "F leaves 1 like a square root: float64 beside it is good to 1e-7",
     },
     presets={"water": {"ior": 1.333}, "glass": {"ior": 1.5}, "diamond": {"ior": 2.417}},

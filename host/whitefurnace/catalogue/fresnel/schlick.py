@@ -1,6 +1,7 @@
 """Schlick's approximation with f0 and f90."""
 import numpy as np
 
+from whitefurnace.catalogue.bibliography import cited
 from whitefurnace.catalogue.model import Model, Parameter
 
 
@@ -32,7 +33,7 @@ ENTRY = Model(
     slot="fresnel",
     name="schlick",
     title="Schlick",
-    citation="Schlick1994",
+    citation=cited("Schlick1994"),
     parameters=(
         Parameter("f0", "F0", "1", 0.0, 1.0, (0.02, 0.04, 0.17, 0.56, 0.95), "reflectance at normal incidence"),
         Parameter("f90", "F90", "1", 0.0, 1.0, (1.0,), "reflectance at grazing incidence", default=1.0),
@@ -40,7 +41,7 @@ ENTRY = Model(
     provides=("FRESNEL_F",),
     reference={"F": _f},
     limits={"0°": lambda f0, f90: (1.0, f0), "90°": lambda f0, f90: (0.0, f90)},
-    facts={"at 0°": "f0", "at 90°": "f90", "presets": "F(0°), linear, from the tables of [Hoffman2012]"},
+    notes={"at 0°": "f0", "at 90°": "f90", "presets": "F(0°), linear, from the tables of [Hoffman2012]"},
     presets={name: {"f0": f0} for name, f0 in _METALS.items()} |
             {name: {"f0": (f0, f0, f0)} for name, f0 in _INSULATORS.items()},
 )

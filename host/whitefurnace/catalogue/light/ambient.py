@@ -1,6 +1,7 @@
 """Ambient light."""
 import numpy as np
 
+from whitefurnace.catalogue.bibliography import cited
 from whitefurnace.catalogue.model import Model, Parameter
 
 
@@ -14,10 +15,10 @@ ENTRY = Model(
     slot="light",
     name="ambient",
     title="Ambient",
-    citation="Hoffman2012",
+    citation=cited("Hoffman2012"),
     parameters=(Parameter("radiance", "L", "W/(m²·sr)", 0.0, 1e30, (0.1, 1.0, 10.0), "radiance from every direction",
                           default=1.0),),
     provides=("LIGHT_L",),
     reference={"L": _l},
-    facts={"reflected": "the directional albedo times the radiance"},
+    notes={"reflected": "the directional albedo times the radiance"},
 )

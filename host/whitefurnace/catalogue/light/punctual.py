@@ -3,6 +3,7 @@ import math
 
 import numpy as np
 
+from whitefurnace.catalogue.bibliography import cited
 from whitefurnace.catalogue.model import Model, Parameter
 
 
@@ -18,7 +19,7 @@ ENTRY = Model(
     slot="light",
     name="punctual",
     title="Punctual",
-    citation="Hoffman2012",
+    citation=cited("Hoffman2012"),
     parameters=(
         Parameter("NoL", "n·l", "1", -1.0, 1.0, (0.05, 0.5, 1.0), "cosine of the light's angle; below 0 it gives 0"),
         Parameter("phi_l", "φl", "rad", -1e6, 1e6, (0.0, math.pi / 2, math.pi), "azimuth of the light", default=0.0),
@@ -27,5 +28,5 @@ ENTRY = Model(
     ),
     provides=("LIGHT_C",),
     reference={"C": _c},
-    facts={"reflected": "π f(l, v) c (n·l)", "white Lambertian facing it": "c"},
+    notes={"reflected": "π f(l, v) c (n·l)", "white Lambertian facing it": "c"},
 )

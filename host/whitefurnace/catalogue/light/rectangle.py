@@ -1,6 +1,7 @@
 """A rectangle of constant radiance."""
 import numpy as np
 
+from whitefurnace.catalogue.bibliography import cited
 from whitefurnace.catalogue.model import Model, Parameter
 
 _FAR = 1e9
@@ -25,7 +26,7 @@ ENTRY = Model(
     slot="light",
     name="rectangle",
     title="Rectangle",
-    citation="Hoffman2012",
+    citation=cited("Hoffman2012"),
     parameters=(
         *(Parameter(f"center_{axis}", f"c{axis}", "any length", -_FAR, _FAR, (typical,), f"{axis} of the centre")
           for axis, typical in zip("xyz", (0.3, -0.2, 1.0), strict=True)),
@@ -36,5 +37,5 @@ ENTRY = Model(
     ),
     provides=("LIGHT_L",),
     reference={"L": _l},
-    facts={"sides": "one: where u × v points", "horizon": "what is below it gives nothing"},
+    notes={"sides": "one: where u × v points", "horizon": "what is below it gives nothing"},
 )

@@ -1,7 +1,7 @@
 """Cook and Torrance's geometry factor of V-grooves."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model
+from whitefurnace.catalogue.model import Checks, Model, Paper
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l):
@@ -22,10 +22,12 @@ ENTRY = Model(
     slot="masking",
     name="cook_torrance",
     title="Cook-Torrance",
-    citation="CookTorrance1982",
+    citation=Paper("CookTorrance1982",
+                   "R. Cook, K. Torrance, A Reflectance Model for Computer Graphics, ACM TOG 1(1), 1982"),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
     # Kinks where the grooves begin to mask: a rule errs by up to this many times its change from the one before.
-    facts={"reciprocal": True, "follows roughness": False, "slow rules": 32.0},
+    checks=Checks(reciprocal=True, slow_rules=32.0),
+    notes={"follows roughness": False},
 )

@@ -1,7 +1,8 @@
 """No masking term at all: V = 1."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l):
@@ -16,9 +17,10 @@ ENTRY = Model(
     slot="masking",
     name="implicit",
     title="Implicit (V = 1)",
-    citation="Hoffman2012",
+    citation=cited("Hoffman2012"),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
-    facts={"reciprocal": True, "follows roughness": False},
+    checks=Checks(reciprocal=True),
+    notes={"follows roughness": False},
 )

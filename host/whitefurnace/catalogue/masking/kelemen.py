@@ -1,7 +1,7 @@
 """Kelemen and Szirmay-Kalos' visibility, 1/(v·h)²."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model
+from whitefurnace.catalogue.model import Checks, Model, Paper
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l):
@@ -16,10 +16,13 @@ ENTRY = Model(
     slot="masking",
     name="kelemen",
     title="Kelemen-Szirmay-Kalos",
-    citation="Kelemen2001",
+    citation=Paper("Kelemen2001",
+                   "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with "
+                   "Importance Sampling, Eurographics short presentations, 2001"),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
     # A peak of 1/(v·h)² where both graze: a rule errs by up to this many times its change from the one before.
-    facts={"reciprocal": True, "follows roughness": False, "slow rules": 8.0},
+    checks=Checks(reciprocal=True, slow_rules=8.0),
+    notes={"follows roughness": False},
 )

@@ -1,7 +1,7 @@
 """Neumann's G = min(n·l, n·v)."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model
+from whitefurnace.catalogue.model import Checks, Model, Paper
 
 
 def _g(NoV, NoL, NoH, VoH, at_v, at_l):
@@ -18,10 +18,12 @@ ENTRY = Model(
     slot="masking",
     name="neumann",
     title="Neumann",
-    citation="Neumann1999",
+    citation=Paper("Neumann1999",
+                   "L. Neumann, A. Neumann, L. Szirmay-Kalos, Compact Metallic Reflectance Models, CGF 18(3), 1999"),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
     # A kink at n·l = n·v: a rule errs by up to this many times its change from the one before.
-    facts={"reciprocal": True, "follows roughness": False, "slow rules": 16.0},
+    checks=Checks(reciprocal=True, slow_rules=16.0),
+    notes={"follows roughness": False},
 )

@@ -3,7 +3,8 @@ import math
 
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _k(alpha):
@@ -32,7 +33,7 @@ ENTRY = Model(
     slot="masking",
     name="schlick_smith",
     title="Schlick's approximation of Smith",
-    citation="Schlick1994",
+    citation=cited("Schlick1994"),
     parameters=(
         Parameter("alpha", "α", "1", 1e-5, 1.0, (1e-4, 0.01, 0.1, 0.5, 1.0),
                   "roughness, the square of the perceptual one; that of the NDF, unless something else is wanted"),
@@ -40,8 +41,8 @@ ENTRY = Model(
     provides=("MASKING_AT", "MASKING_V", "MASKING_G", "MASKING_G1"),
     reference={"V": _v, "G": _g, "G1": _g1},
     from_roughness=lambda r: {"alpha": r * r},
-    facts={
-        "reciprocal": True,
+    checks=Checks(reciprocal=True),
+    notes={
         "follows roughness": True,
         # Below Smith everywhere but at n·v = 1, at grazing by Smith's slope over this one's: A(0)/(α√(2/π)).
         "G1 less Smith's": "Beckmann: -.455, -.441, -.388, -.335 at most for α = .01, .1, .5, 1 "

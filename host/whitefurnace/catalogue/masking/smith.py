@@ -1,7 +1,8 @@
 """Smith's masking-shadowing, height-correlated, for any NDF."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model
 
 
 def _g1(NoV, at_v):
@@ -30,10 +31,11 @@ ENTRY = Model(
     slot="masking",
     name="smith",
     title="Smith, height-correlated",
-    citation="Heitz2014",
+    citation=cited("Heitz2014"),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G", "MASKING_G1"),
     needs=("NDF_AREA",),
     reference={"V": _v, "G": _g, "G1": _g1},
-    facts={"reciprocal": True, "follows roughness": True, "weak furnace": 1.0},
+    checks=Checks(reciprocal=True, weak_furnace=1.0),
+    notes={"follows roughness": True},
 )

@@ -2,7 +2,7 @@
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
 from whitefurnace.catalogue.numerics import expm1_ratio
 from whitefurnace.catalogue.roughness import alpha_within
 
@@ -49,7 +49,9 @@ ENTRY = Model(
     slot="ndf",
     name="abc",
     title="ABC",
-    citation="Low2012",
+    citation=Paper("Low2012",
+                   "J. Löw et al., BRDF Models for Accurate and Efficient Rendering of Glossy Surfaces, ACM TOG "
+                   "31(1), 2012"),
     parameters=(B, C),
     provides=("NDF_D", "NDF_WIDTH", "NDF_REACH"),
     reference={"D": _d},
@@ -57,8 +59,8 @@ ENTRY = Model(
     constant_names=("norm",),
     # GGX in disguise: (1 + b(1 - cos θ))^-2 with 2(1 - cos θ) for sin²θ.
     from_roughness=lambda r: {"b": np.minimum(2 * (1 / alpha_within(r, _ALPHA) ** 2 - 1), B.high), "c": 2.0},
-    facts={
-        "normalized": True,
+    checks=Checks(normalized=True, float32_error=3.5e-6),
+    notes={
         "tail": "D falls like (1 - cos θ)^-c",
         "float32": "relative error of D at most 3.5e-6 where D > 1e-7 of its peak; 2.5e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-38 of it",

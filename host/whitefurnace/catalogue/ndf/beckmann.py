@@ -3,7 +3,8 @@ import math
 
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
 ALPHA = Parameter("alpha", "α", "1", 1e-5, 1.0, (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 1.0),
@@ -31,13 +32,13 @@ ENTRY = Model(
     slot="ndf",
     name="beckmann",
     title="Beckmann",
-    citation="Walter2007",
+    citation=cited("Walter2007"),
     parameters=(ALPHA,),
     provides=("NDF_D", "NDF_AREA", "NDF_WIDTH", "NDF_REACH", "NDF_SAMPLE"),
     reference={"D": _d, "area": _area},
     from_roughness=lambda r: {"alpha": alpha_within(r, ALPHA)},
-    facts={
-        "normalized": True,
+    checks=Checks(normalized=True, float32_error=5.5e-6),
+    notes={
         "projected area": "closed, with erf",
         "tail": "D falls like exp(-tan²θ/α²)",
         "float32": "relative error of D at most 5.5e-6 where D > 1e-7 of its peak; 6e-7 (1 + |log(D/peak)|) below, "

@@ -1,7 +1,8 @@
 """GGX (Trowbridge-Reitz)."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
 ALPHA = Parameter("alpha", "α", "1", 1e-5, 1.0, (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 1.0),
@@ -26,14 +27,14 @@ ENTRY = Model(
     slot="ndf",
     name="ggx",
     title="GGX (Trowbridge-Reitz)",
-    citation="Walter2007",
+    citation=cited("Walter2007"),
     parameters=(ALPHA,),
     provides=("NDF_D", "NDF_AREA", "NDF_WIDTH", "NDF_SAMPLE"),
     reference={"D": _d, "area": _area},
     from_roughness=lambda r: {"alpha": alpha_within(r, ALPHA)},
     past_one=lambda r: {"alpha": r * r},  # thin at the pole then, and still a density
-    facts={
-        "normalized": True,
+    checks=Checks(normalized=True, float32_error=8e-7),
+    notes={
         "projected area": "closed",
         "tail": "D falls like 1/sin⁴θ",
         "float32": "relative error of D at most 8e-7",

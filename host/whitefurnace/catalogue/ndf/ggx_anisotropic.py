@@ -1,7 +1,8 @@
 """Anisotropic GGX."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
 ALPHA_X, ALPHA_Y = (
@@ -33,14 +34,14 @@ ENTRY = Model(
     slot="ndf",
     name="ggx_anisotropic",
     title="GGX (Trowbridge-Reitz), anisotropic",
-    citation="Heitz2014",
+    citation=cited("Heitz2014"),
     parameters=(ALPHA_X, ALPHA_Y),
     provides=("NDF_D", "NDF_AREA", "NDF_STRETCH_X", "NDF_STRETCH_Y", "NDF_SAMPLE"),
     reference={"D": _d, "area": _area},
     isotropic=False,
     from_roughness=lambda r: {"alpha_x": alpha_within(r, ALPHA_X), "alpha_y": alpha_within(r, ALPHA_Y)},
-    facts={
-        "normalized": True,
+    checks=Checks(normalized=True, float32_error=8.5e-7),
+    notes={
         "projected area": "closed",
         "tail": "D falls like 1/sin⁴θ",
         "float32": "relative error of D at most 8.5e-7",

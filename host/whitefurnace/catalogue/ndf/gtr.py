@@ -1,7 +1,8 @@
 """Generalized Trowbridge-Reitz."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.bibliography import cited
+from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.numerics import expm1_ratio
 from whitefurnace.catalogue.roughness import alpha_within
 
@@ -40,15 +41,15 @@ ENTRY = Model(
     slot="ndf",
     name="gtr",
     title="Generalized Trowbridge-Reitz (GTR)",
-    citation="Burley2012",
+    citation=cited("Burley2012"),
     parameters=(ALPHA, GAMMA),
     provides=("NDF_D", "NDF_WIDTH", "NDF_REACH", "NDF_SAMPLE"),
     reference={"D": _d},
     constants=_constants,
     constant_names=("peak",),
     from_roughness=lambda r: {"alpha": alpha_within(r, ALPHA), "gamma": 2.0},  # GGX
-    facts={
-        "normalized": True,
+    checks=Checks(normalized=True, float32_error=3e-6),
+    notes={
         "tail": "D falls like sin^-2γ θ",
         "float32": "relative error of D at most 3e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-38 of it",

@@ -2,7 +2,7 @@
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
-from whitefurnace.catalogue.model import Model, Parameter
+from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
 ALPHA = Parameter("alpha", "α", "1", 1e-4, 1.0, (1e-4, 1e-3, 0.01, 0.1, 0.5, 1.0),
@@ -47,7 +47,9 @@ ENTRY = Model(
     slot="ndf",
     name="shifted_gamma",
     title="Shifted gamma",
-    citation="Bagher2012",
+    citation=Paper("Bagher2012",
+                   "M. Bagher, C. Soler, N. Holzschuch, Accurate Fitting of Measured Reflectances Using a Shifted "
+                   "Gamma Micro-facet Distribution, CGF 31(4), 2012"),
     parameters=(ALPHA, P),
     provides=("NDF_D", "NDF_WIDTH", "NDF_REACH"),
     reference={"D": _d},
@@ -55,8 +57,8 @@ ENTRY = Model(
     constant_names=("norm",),
     # p = 2: the core is GGX's slope density of the same α, (1 + tan²θ/α²)^-2, its tail cut by e^(-tan²θ/α).
     from_roughness=lambda r: {"alpha": alpha_within(r, ALPHA), "p": 2.0},
-    facts={
-        "normalized": True,
+    checks=Checks(normalized=True, float32_error=5.5e-6),
+    notes={
         "tail": "D falls like exp(-tan²θ/α), before it like (α² + tan²θ)^-p",
         "float32": "relative error of D at most 5.5e-6 where D > 1e-7 of its peak; 5e-7 (1 + |log(D/peak)|) below, "
                    "0 below 1e-34 of it",
