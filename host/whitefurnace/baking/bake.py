@@ -1,4 +1,4 @@
-"""One environment -> the files engines load: key, skipping, ownership, writing, manifest."""
+"""Bakes environments into the files that engines load: plans, reads, computes and writes each of them."""
 from __future__ import annotations
 
 import contextlib
@@ -60,7 +60,10 @@ smooth lobes are a rim at the horizon, hard panels do not reach 1e-3 on any grid
 
 
 def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
-    """The built-in environment: sky, ground, and a sun over 1e5 times the mean radiance, by a kernel."""
+    """The built-in environment: sky, ground, and a sun of more than 1e5 times the mean radiance, made by a kernel.
+
+    height: rows of the lat-long.
+    """
     program = device.build(source.demo().text, {"W": 1, "T": 1, "PRECISION": 32})
     # At the centre of a texel, so that the disc covers one whole and the maximum is the sun's own radiance.
     theta = (round(0.29 * height) + 0.5) * math.pi / height
@@ -77,27 +80,35 @@ def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
 
 @dataclass(frozen=True)
 class Baked:
-    """What a bake did or would do for one environment: `done`, `skipped` or `planned`, and its manifest."""
+    """What a bake did or would do for one environment.
+
+    name: of its outputs. state: "done", "skipped" or "planned". files: paths, and nbytes: bytes of the arrays of each
+    before compression. manifest: of a planned one its key and its recipe alone. plan: each distinct level, with the
+    engines that it is for. levels: rows of the manifest with the seconds that each took. as_read: errors after the
+    engine's sampling (`reading.AsRead.data`); of a planned one, those of chains that could be had too. programs: the
+    kernel programs that a planned one compiles to.
+    """
 
     name: str
     state: str
     files: tuple[Path, ...]
     manifest: dict[str, Any]
     plan: tuple[tuple[tuple[str, ...], LevelPlan], ...]
-    """Each distinct level, with the engines it is for."""
     nbytes: tuple[int, ...]
     notices: tuple[str, ...]
     levels: tuple[dict[str, Any], ...] = ()
     seconds: float = 0.0
     as_read: tuple[dict[str, Any], ...] = ()
-    """What an engine shows of the chain (reading.AsRead.data): of this one, or in a plan of what could be had too."""
     programs: tuple[Program, ...] = ()
-    """Of a plan, the kernel programs that it compiles to."""
 
 
 @dataclass(frozen=True)
 class BakePlan:
-    """A validated bake of several environments: engines, and the chain of each."""
+    """A validated bake of several environments.
+
+    names, sources: name of the outputs of each environment, and the environment. engines, chains: the target engines,
+    and the chain of each. The rest are options of `bake`.
+    """
 
     names: tuple[str, ...]
     sources: tuple[Any, ...]
@@ -114,12 +125,15 @@ class BakePlan:
 
     @property
     def recipe(self) -> Chain:
-        """What all chains have in common: NDF, tolerance, certificates."""
+        """The first chain, for what all chains have in common: NDF, tolerance, certificates."""
         return self.chains[0]
 
 
 def plan(request: BakeRequest) -> BakePlan:
-    """Check every option of a request and find the chain of each engine. Raises UsageError, UnsupportedError."""
+    """Check every option of a request and find the chain of each engine.
+
+    Nothing is read but descriptions of engines and NDFs. Raises UsageError, UnsupportedError, FileError, InputError.
+    """
     if not request.sources:
         raise UsageError("no environment was given")
     names = [name_of(item) for item in request.sources]
@@ -147,7 +161,10 @@ def plan(request: BakeRequest) -> BakePlan:
 
 
 def name_of(item: Any) -> str:
-    """The name that outputs of a source have. Raises UsageError for what is no source, or cannot name a file."""
+    """The name of the outputs of a source: a path's stem, "demo", "array", or an environment's own name.
+
+    Raises UsageError for an object that is no source and for a name that cannot be a file's.
+    """
     if isinstance(item, Environment):
         name = item.name
     elif isinstance(item, (str, os.PathLike)):
@@ -185,7 +202,7 @@ def _chain(engine: Engine, request: BakeRequest) -> Chain:
 
 
 def _is_demo(item: Any) -> bool:
-    """The word `demo` is the built-in environment, unless there is such a path: a path always wins."""
+    """Whether a source is the built-in environment: the word `demo`, unless there is a path of that name."""
     return str(item) == DEMO and not os.path.exists(item)
 
 
@@ -230,7 +247,7 @@ def bake(sources: Source | Sequence[Source], output: str | os.PathLike[str], *, 
 
 def bake_one(request: BakePlan, k: int, device: Device | str | None = None, *, dry_run: bool = False,
              progress: Callable[[str, str, float], None] | None = None) -> Baked:
-    """Bake the k-th environment of a plan."""
+    """Bake the k-th environment of a plan. Raises what `bake` raises."""
     found = read(request, k, device, dry_run=dry_run)
     if isinstance(found, Baked):
         return found
@@ -270,8 +287,12 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Computed:
-    """What the device made of an environment, to be encoded and written. `written` are its files where what an engine
-    reads of them was measured."""
+    """What the device made of an environment, to be encoded and written.
+
+    of: for each engine, the places of its own chain and of Charlie's in `lit.chains`. table, splits: the (scale, bias)
+    table, and each engine's own. window: the windowed harmonics. written, as_read: its files, and errors after the
+    engine's sampling, where these were measured.
+    """
 
     loaded: Loaded
     on: Device
@@ -285,7 +306,7 @@ class Computed:
 
 
 def manifest_path(request: BakePlan, k: int) -> Path:
-    """Where the manifest of the k-th environment is."""
+    """Path of the manifest of the k-th environment."""
     return request.output / f"{request.names[k]}.json"
 
 
@@ -407,14 +428,17 @@ def _give_up(lock: Lock | None, made: Sequence[Path]) -> None:
 
 
 def abandon(found: Loaded | Computed, *, folders: bool = False) -> None:
-    """Lets go of an item that will not be written, and with `folders` of those made for it that are empty."""
+    """Release the lock of an environment that will not be written; with `folders`, remove those made for it."""
     loaded = found.loaded if isinstance(found, Computed) else found
     _give_up(loaded.lock, loaded.made if folders else ())
 
 
 def compute(loaded: Loaded, device: Device | str | None = None,
             progress: Callable[[str, str, float], None] | None = None) -> Computed:
-    """All that the device does for an environment. Raises CheckError, DeviceError, UnsupportedError."""
+    """Do all of the device's work for an environment.
+
+    progress: as for `bake`. Raises CheckError, DeviceError, UnsupportedError.
+    """
     request, name = loaded.request, loaded.request.names[loaded.k]
     with system_errors(request.output):
         on = loaded.on or (device if isinstance(device, Device) else choose_device(device))
@@ -447,8 +471,10 @@ def _encoded(made: Computed) -> list[Encoded]:
 
 
 def write(made: Computed) -> Baked:
-    """Encodes and writes what was computed, the manifest last, and lets go of the lock. Needs no device. Raises
-    FileError; then nothing was written."""
+    """Encode and write what was computed, the manifest last, and release the lock. Needs no device.
+
+    Raises FileError; then nothing was written.
+    """
     try:
         with system_errors(made.loaded.request.output):
             return _write(made)
@@ -486,7 +512,7 @@ def _write(made: Computed) -> Baked:
 
 
 def targets_of(request: BakePlan, name: str) -> list[Target]:
-    """The files of every engine, for an environment of that name."""
+    """The planned files of every engine, for an environment of that name."""
     return [target for engine, recipe in zip(request.engines, request.chains, strict=True)
             for target in targets(engine, recipe, request.output, name)]
 
@@ -520,23 +546,25 @@ def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
 
 
 def _rows_of(request: BakePlan, lit: Lighting, of: Sequence[tuple[int, int]],
-             what: str) -> list[tuple[Level, float | None, str, tuple[str, ...]]]:
-    """Each distinct level of `what` (a field of Filtered), what of the energy it keeps (of levels alone), its NDF and
-    the engines it is for."""
+             name: str) -> list[tuple[Level, float | None, str, tuple[str, ...]]]:
+    """Each distinct level of `name`, a field of Filtered, from large to small and from smooth to rough.
+
+    With it: the energy that it keeps (of "levels" alone), its NDF and the engines it is for.
+    """
     found: dict[int, tuple[Level, float | None, str, tuple[str, ...]]] = {}
     for e, engine in enumerate(request.engines):
         for place, ndf in zip(of[e], (request.recipe.ndf.model.name, "charlie"), strict=True):
             if place == of[e][1] and not engine.holding("sheen") and place != of[e][0]:
                 continue
             chain_: Filtered = lit.chains[place]
-            if what in ("levels", "coverage") and not engine.cubes("specular"):
+            if name in ("levels", "coverage") and not engine.cubes("specular"):
                 continue
-            if what.startswith("octahedral") and not engine.octahedral:
+            if name.startswith("octahedral") and not engine.octahedral:
                 continue
-            if what in ("latlongs", "latlong_coverage") and not (engine.latlong or engine.holding("environment")):
+            if name in ("latlongs", "latlong_coverage") and not (engine.latlong or engine.holding("environment")):
                 continue
-            levels = getattr(chain_, what)
-            kept = chain_.energy_kept if what == "levels" else [None] * len(levels)
+            levels = getattr(chain_, name)
+            kept = chain_.energy_kept if name == "levels" else [None] * len(levels)
             for level, k in zip(levels, kept, strict=True):
                 old = found.get(id(level), (level, k, ndf, ()))  # level 0 is of every NDF
                 names = old[3] if engine.name in old[3] else (*old[3], engine.name)
@@ -573,7 +601,7 @@ def planned_levels(request: BakePlan, texel: float) -> tuple[tuple[tuple[str, ..
 
 def _as_read(request: BakePlan, on: Device, env: Environment, lit: Lighting, of: Sequence[tuple[int, int]],
              written: Sequence[Encoded]) -> list[dict[str, Any]]:
-    """What each engine shows of its chain, in its mapping and from its format."""
+    """Errors of each engine's chain after its sampling, in its mapping and from its format."""
     rows: list[dict[str, Any]] = []
     read = [e for e, engine in enumerate(request.engines) if engine.cubes("specular")]
     if not read:
@@ -590,11 +618,11 @@ def _as_read(request: BakePlan, on: Device, env: Environment, lit: Lighting, of:
 
 
 FORMAT_LOSS = 0.05
-"""A format that costs a level's p99 more than this is worth a notice."""
+"""A pixel format that adds more than this to the texel error (p99) of a level is worth a notice."""
 
 
 def format_notices(manifest: Mapping[str, Any]) -> list[str]:
-    """What formats cost that users would want to know."""
+    """Notices of what pixel formats lose: clipped values, windowed harmonics, large errors."""
     found = []
     for name, entry in manifest["files"].items():
         if entry.get("clipped"):
@@ -613,7 +641,7 @@ def format_notices(manifest: Mapping[str, Any]) -> list[str]:
 
 def _would_read(request: BakePlan, env: Environment, device: Device | str | None,
                 on: Device | None) -> tuple[tuple[dict[str, Any], ...], tuple[str, ...]]:
-    """What engines would show of the planned chain and of others, and notices: a plan needs no device for the rest."""
+    """Errors after the engine's sampling of the planned chain and of others, and notices; empty without a device."""
     try:
         on = on or choose_device(device if isinstance(device, str) else None)
     except DeviceError as error:
@@ -631,7 +659,7 @@ def _would_read(request: BakePlan, env: Environment, device: Device | str | None
 
 
 def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str, Any]:
-    """The recipe as data: everything that changes the bytes, and nothing else."""
+    """The recipe as data for the key: everything that changes the bytes, and nothing else."""
     own = {e.name: {"engine": e.data(), "chain": c.canonical()}
            for e, c in zip(request.engines, request.chains, strict=True) if e.container == "files" or e.without}
     return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines),
@@ -649,7 +677,7 @@ class EntryKey:
     identity: int
     given: tuple[tuple[str, Any], ...]
     choice: Chosen = field(compare=False)
-    """Kept too, so that no other entry takes its identity."""
+    """Kept so that no other entry takes its identity."""
 
     @staticmethod
     def of(choice: Chosen) -> EntryKey:
@@ -658,7 +686,7 @@ class EntryKey:
 
 @lru_cache(maxsize=4)
 def _table(device: Device, ndf: EntryKey) -> Integrated:
-    """The DFG table: of the NDF and the device alone, so the same for every image. Not to be written to."""
+    """The (scale, bias) table, read-only; it depends on the NDF and the device alone, not on the image."""
     table = dfg(DFG_SIZE, ndf=ndf.choice, tolerance=DFG_TOLERANCE, device=device)
     table.values.flags.writeable = False
     return table
@@ -666,7 +694,7 @@ def _table(device: Device, ndf: EntryKey) -> Integrated:
 
 @lru_cache(maxsize=16)
 def _split(device: Device, ndf: EntryKey, engine: Engine) -> SplitSum:
-    """The table of a preset, the same for every image."""
+    """The split-sum table of an engine, the same for every image."""
     return split_sum(engine.dfg, device=device, ndf=ndf.choice)
 
 
@@ -688,8 +716,8 @@ def _manifest(request: BakePlan, name: str, env: Environment, sun: Sun | None, r
         data |= {"ndf": ndf} if ndf not in (None, request.recipe.ndf.model.name) else {}
         return data if kept is None else {**data, "energy_kept": 1 + kept}
 
-    def rows(what: str) -> list[dict[str, Any]]:
-        return [row(*found) for found in _rows_of(request, lit, of, what)]
+    def rows(name: str) -> list[dict[str, Any]]:
+        return [row(*found) for found in _rows_of(request, lit, of, name)]
 
     cube = Shape(False, IRRADIANCE_SIZE)
     off, most = harmonic.rmse_against(window.values, lit.irradiance.texels, cube.directions(), cube.solid_angles())

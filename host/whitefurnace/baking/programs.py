@@ -19,8 +19,10 @@ LEAST_TERMS = 16
 
 @dataclass(frozen=True)
 class Program:
-    """A program by what it is for; `when` is empty, or says on what of the image or of the device it depends that it is
-    built."""
+    """A kernel program of a bake.
+
+    name: what it is for. when: what of the image or of the device decides that it is built; empty where it always is.
+    """
 
     name: str
     source: Source
@@ -28,10 +30,11 @@ class Program:
 
     @property
     def nbytes(self) -> int:
+        """Bytes of its text."""
         return len(self.source.text.encode())
 
     def data(self) -> dict[str, Any]:
-        """As data for JSON."""
+        """The program as data for JSON."""
         text = self.source.text
         return {"program": self.name, "when": self.when or None, "digest": self.source.digest, "bytes": self.nbytes,
                 "lines": text.count("\n"), "text": text}
@@ -39,8 +42,11 @@ class Program:
 
 def programs(chains: Sequence[Chain], kind: str, texel: float, *, demo: bool = False,
              charlie: bool = False) -> tuple[Program, ...]:
-    """What a bake of `chains` builds of a source of the kind "latlong" or "cube" with texels of `texel` radians, the
-    table of split sums included; `charlie`: with Charlie's albedo in it. Equal texts once."""
+    """The programs that a bake builds, the table of split sums included; equal texts once.
+
+    chains: of the engines. kind: "latlong" or "cube". texel: width of a source texel in radians. demo: whether the
+    built-in environment is made. charlie: whether a table has Charlie's albedo.
+    """
     found: dict[str, Program] = {}
     for one in _programs(chains, kind, texel, demo, charlie):
         old = found.get(one.source.digest)
@@ -80,14 +86,14 @@ def _programs(chains: Sequence[Chain], kind: str, texel: float, demo: bool, char
 
 
 def _derived(entry: Model) -> Iterator[Program]:
-    """What is to be known of a user's NDF."""
+    """Programs that measure a user's NDF: its shape, its norm and its lobe."""
     yield Program(f"shape of {entry.name}", source.evaluation("NDF_D", {"ndf": entry}))
     for one in (integral("normalization"), LOBE):
         yield Program(f"{one.title} of {entry.name}", source.integration(one, {"ndf": entry}))
 
 
 def _integrated(name: str, ndf: Model) -> Iterator[Program]:
-    """An integral over an NDF with Smith's masking and white Fresnel, as `run.integrate` has it."""
+    """Programs of an integral over an NDF with Smith's masking and white Fresnel, as `integrate` builds them."""
     entry = integral(name)
     slots = {"ndf": ndf, "masking": model("masking", "smith")}
     if name != "dfg":
