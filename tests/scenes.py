@@ -62,7 +62,7 @@ def as_glb(path: Path, doc: dict[str, Any]) -> Path:
 
 
 def helmet(path: Path) -> Path:
-    """The scene of the README: a metal whose roughness is a texture's, rubber, and a visor of rough glass."""
+    """The scene of docs/scene.md: a metal whose roughness is a texture's, rubber, and a visor of rough glass."""
     wear = np.full((32, 32, 3), 255, np.uint8)
     wear[..., 1] = np.linspace(70, 160, 32).astype(np.uint8)[:, None]
     visor = {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_ior": {"ior": 1.58},

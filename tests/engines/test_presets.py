@@ -349,7 +349,7 @@ def test_blocks(tmp_path, device):
     path = tmp_path / "blocks" / "array.dds"
     assert path.stat().st_size == 148 + sum(6 * s * s for s in (128, 64, 32, 16, 8))
     texture, entry = read_texture(path), made.manifest["files"]["blocks/array.dds"]
-    # [README, "What the numbers mean"]
+    # [docs/accuracy.md]
     with np.load(tmp_path / "raw" / "array.npz") as archive:
         true = archive["specular_0"].astype(np.float64)
     off = np.abs(decode(texture, 0) - true) / np.maximum(true, 1e-3 * true.mean())
