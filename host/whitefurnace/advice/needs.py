@@ -1,5 +1,5 @@
-"""What of a bake a scene's materials can read: every level, lobe, integral and table of an engine, needed or not, with
-the reason, and the smallest bake that has what is."""
+"""Lists which parts of a bake a scene's materials can read, with the reason for each, and derives the smallest bake
+that has the needed ones."""
 from __future__ import annotations
 
 import json
@@ -25,15 +25,15 @@ from whitefurnace.rendering.shading import SHADINGS, karis
 from whitefurnace.scenes.materials import Material, Scene, Spread
 
 NEGLIGIBLE = 1 / 510
-"""Of white: half a step of 8 bits. A weight below it changes no pixel."""
+"""Half a step of 8 bits, in units of white. A weight below it changes no pixel."""
 
 TABLE = 128
-"""Texels a side of the smallest split-sum table of a power of two whose bilinear reads err by NEGLIGIBLE at most (p99
-over n·v and r, GGX under Smith's masking: 7e-4, over r > .7 1.4e-3; of 64² 3e-3 to 5e-3). What binds are reads at n·v
-below half a texel, whatever the roughness: so the roughness in use buys no smaller table."""
+"""Texels a side of the smallest split-sum table, a power of two, whose bilinear reads err by at most NEGLIGIBLE (p99
+over n·v and r, GGX under Smith's masking: 7e-4, over r > .7 1.4e-3; a table of 64² errs by 3e-3 to 5e-3). The largest
+errors are at n·v below half a texel, whatever the roughness; so a scene's roughness values allow no smaller table."""
 
 TEXEL = math.pi / 512
-"""Of an environment of 1K: the plan's products do not depend on it."""
+"""Angle of a texel of a 1K environment. The plan's products do not depend on it."""
 
 GLASS = 32
 """Cells a side of a table of rough glass for one index of refraction."""
@@ -43,8 +43,11 @@ Kind = Literal["level", "lobe", "integral", "table", "file", "effect"]
 
 @dataclass(frozen=True)
 class Need:
-    """One thing a bake could hold: needed, not, or None: no image-based table can give it. `nbytes` are what it has in
-    the engine's full set, `kept` in what the scene needs, before compression."""
+    """One part that a bake could have.
+
+    needed  True or False; None if no image-based table can give it
+    nbytes  bytes before compression in the engine's full set; `kept`: in what the scene needs
+    """
 
     what: str
     kind: Kind
@@ -56,9 +59,16 @@ class Need:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a scene needs of an engine. `own` is the engine without what is not needed, None where nothing is; `chain`
-    its chain, `full` the engine's usual one; `tables` are options of `lut` with a file's name as `output`, `cloth` the
-    options of a further bake of Charlie's chain; bytes and predicted processor seconds of both."""
+    """The parts of an engine's bake that a scene needs.
+
+    own      the engine with only the needed files, None where nothing is needed; `chain` its chain
+    full     the engine's usual chain
+    without  parts that are left out; `table`: texels a side of a smaller split-sum table, or None
+    rows     every part, needed or not
+    tables   options of `lut` for further tables, with a file's name as `output`
+    cloth    options of a further bake of Charlie's chain, or None
+    nbytes   bytes before compression, and `seconds` predicted processor seconds; `full_...`: of the usual bake
+    """
 
     engine: Engine
     own: Engine | None
@@ -76,7 +86,7 @@ class Needs:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Of `bake`: what differs from the engine's usual."""
+        """Options of `bake` that differ from the engine's usual bake."""
         if self.chain is None:
             return {}
         found: dict[str, Any] = {}
@@ -90,14 +100,14 @@ class Needs:
 
 
 def only_text(recipe: Chain) -> str:
-    """The levels that are made, as --only-levels has them."""
+    """The levels that are made, in the form that --only-levels takes."""
     assert recipe.only
     return f"{recipe.only[0]}-{recipe.only[1]}"
 
 
 @dataclass(frozen=True)
 class Lobe:
-    """A reflection of a material: which one, and its perceptual roughness as the engine has it."""
+    """A reflection of a material, with its perceptual roughness as the engine shades it."""
 
     material: str
     what: str
@@ -105,7 +115,8 @@ class Lobe:
 
 
 def lobes(scene: Scene, least: float = 0.0) -> list[Lobe]:
-    """The GGX lobes of a scene: each material's own and its clear coat's. An engine shades with `least` at least."""
+    """The GGX lobes of a scene: each material's own and its clear coat's. least: smallest roughness that the engine
+    shades."""
     found = []
     for m in lit(scene):
         if m["specular"].most > 0 or m["metalness"].most > 0:
@@ -116,7 +127,7 @@ def lobes(scene: Scene, least: float = 0.0) -> list[Lobe]:
 
 
 def lit(scene: Scene) -> list[Material]:
-    """Materials that light falls on."""
+    """The materials of a scene that are not unlit."""
     return [m for m in scene.materials if not m.unlit]
 
 
@@ -125,7 +136,8 @@ def _at_least(spread: Spread, least: float) -> Spread:
 
 
 def read_shares(found: Sequence[Lobe], recipe: Chain) -> np.ndarray:
-    """(levels,) the part of all reads that each level gets, over lobes alike; what is read at all is over 0."""
+    """Share of all reads that each level of a chain gets, (levels,), if all lobes read equally often. Every level that
+    is read at all has a share above 0."""
     weights = np.zeros(len(recipe.levels))
     for lobe in found:
         for low, high, share in lobe.roughness.shares:
@@ -139,8 +151,10 @@ def read_shares(found: Sequence[Lobe], recipe: Chain) -> np.ndarray:
 
 
 def smallest(engine: Engine, full: Chain, found: Sequence[Lobe]) -> Chain:
-    """The engine's usual chain from the first level that is read to the last: nothing that a surface reads changes.
-    Mips of one texture are all there."""
+    """The engine's usual chain, from the first level that is read to the last.
+
+    Everything that a surface reads stays the same. Where the levels are mips of one texture, all of them stay.
+    """
     if engine.container == "files":
         return full
     read = np.flatnonzero(read_shares(found, full))
@@ -149,8 +163,8 @@ def smallest(engine: Engine, full: Chain, found: Sequence[Lobe]) -> Chain:
 
 
 def diffuse_weight(engine: Engine, m: Material) -> float:
-    """The most that the engine multiplies E/π with for a material, over n·v and its roughness; of light through the
-    surface too."""
+    """The largest factor by which the engine multiplies E/π for a material, over n·v and the material's roughness;
+    light through the surface counts too."""
     NoV, r = (x.ravel() for x in np.meshgrid(np.linspace(0.05, 1, 12), np.linspace(
         max(m["roughness"].least, engine.least), max(m["roughness"].most, engine.least), 5)))
     A, B = karis(NoV, r)
@@ -165,7 +179,7 @@ def diffuse_weight(engine: Engine, m: Material) -> float:
 
 
 def needs(scene: Scene, engine: Engine, *, background: bool = False) -> Needs:
-    """What a scene needs of what is baked for an engine. background: the environment itself is seen too."""
+    """The parts of an engine's bake that a scene needs. background: True if the environment itself is visible."""
     full = chain(lods=engine.lods, usual_min=engine.min_size, size=engine.size,
                  **({"levels": engine.levels} if engine.levels else {}))  # type: ignore[arg-type]
     return _Deciding(scene, engine, full, background).made()
@@ -225,8 +239,8 @@ class _Deciding:
             yield "skybox"
 
     def _table_size(self) -> int | None:
-        """Texels a side where fewer do than the engine has, else None. Its √n·v axis is another matter, and Charlie's
-        albedo was not measured."""
+        """Texels a side of the split-sum table where fewer than the engine's are enough, else None. Tables with an axis
+        of √n·v, and with Charlie's albedo, stay as they are, since they were not measured."""
         larger = self.engine.holding("dfg") and self.engine.dfg.size > TABLE and self.engine.dfg.NoV == "centres"
         return TABLE if larger and not (self.sheens and self.engine.dfg.charlie) else None
 
@@ -306,7 +320,7 @@ class _Deciding:
             self.rows.append(Need("Charlie's albedo in it", "table", bool(self.sheens), _sheen_text(self.sheens)))
 
     def _tables(self) -> Iterator[dict[str, Any]]:
-        """Tables beside what the engine has, for renderers that are one's own."""
+        """Options of `lut` for tables that the engine does not have, for users' own renderers."""
         free = self.engine.container != "files"
         clear = [m for m in self.lit if m["transmission"].most > 0]
         rough = [m for m in clear if m["roughness"].most > 0]
@@ -348,7 +362,7 @@ class _Deciding:
         return {"ndf": "charlie", **only, "without": without}
 
     def _effects(self) -> None:
-        """What materials have that no table of an environment gives."""
+        """Adds rows for effects of the materials that no table of an environment gives."""
         def add(what: str, which: Sequence[Material], reason: str) -> None:
             if which:
                 self.rows.append(Need(what, "effect", None, f"{_some([m.name for m in which])}: {reason}"))
@@ -372,7 +386,7 @@ class _Deciding:
 
 
 def seconds(engine: Engine, recipe: Chain) -> float:
-    """Processor seconds of a bake without those of reading the image, as `bake --dry-run` of a job predicts them."""
+    """Predicted processor seconds of a bake, without reading the image, as `batch --dry-run` states them."""
     pairs = 0
     if engine.needs("specular"):
         pairs += sum(level.pairs for level in plan_chain(recipe, TEXEL))
@@ -386,7 +400,7 @@ def _bytes(engine: Engine, recipe: Chain) -> int:
 
 
 def _parts(engine: Engine, recipe: Chain) -> dict[str, int]:
-    """Bytes by what a file holds."""
+    """Bytes of the files by their content."""
     texels = sum(6 * s * s for s, _ in recipe.levels)
     if engine.container == "npz":
         sizes = {"specular": 12 * texels, "irradiance": 72 * IRRADIANCE_SIZE**2, "sh": 108, "dfg": 8 * DFG_SIZE**2}
@@ -419,7 +433,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def bakes(found: Needs, output: str) -> list[dict[str, Any]]:
-    """The bakes that each environment needs: options of a `BakeRequest`, and the folder as `output`."""
+    """The bakes that each environment needs: options of a `BakeRequest`, with the folder as `output`."""
     if found.own is None:
         return []
     made = [{"output": output, **found.options}]
@@ -430,8 +444,13 @@ def bakes(found: Needs, output: str) -> list[dict[str, Any]]:
 
 def write_job(path: str | os.PathLike[str], found: Needs, name: str, scene: str, environments: Sequence[str], *,
               force: bool = False) -> None:
-    """Writes a job for `batch` of what a scene needs, outputs into a folder of its name beside it; `name` is the
-    engine's as --for has it. Raises FileError for what is there and is another, or cannot be written, UsageError."""
+    """Write a job for `batch` that bakes what a scene needs.
+
+    path: a .toml file. Outputs go into a folder of its name next to it. name: the engine as --for takes it.
+    environments: paths or "demo". force: replace another job.
+
+    Raises FileError for another job at `path` or one that cannot be read or written, UsageError for another suffix.
+    """
     path = Path(path)
     if path.suffix.lower() != ".toml":
         raise UsageError(f"{path}: a job is a .toml file")
@@ -475,7 +494,7 @@ def _toml(value: Any) -> str:
 
 
 def one_engine(found: Sequence[Engine]) -> Engine:
-    """Raises UsageError for several: each needs its own sizes."""
+    """The engine of a list of one. Raises UsageError for several, since each needs its own sizes."""
     if len(found) != 1:
         raise UsageError("scene decides for one engine at a time: give one NAME to --for")
     return found[0]

@@ -1,4 +1,4 @@
-"""The trade of error against time as a PNG."""
+"""Draws error against time of the prefilter as a PNG."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 
 
 def draw_tradeoff(folder: Path, points: Sequence[Point], costs: Sequence[Cost], device: Device) -> Path:
-    """`folder`/tradeoff.png: error against seconds for each environment with its Pareto front, then the costs.
+    """Draw error against seconds for each environment with its Pareto front, then the costs, into
+    `folder`/tradeoff.png.
 
-    Raises as `draw` does.
+    Returns the file's path. Raises the errors of `drawing`.
     """
     from whitefurnace.benching.tradeoff import COST_TOLERANCE
 

@@ -1,5 +1,6 @@
-"""The throughput of every kernel, and its ratio to the multiply-adds and the memory bandwidth of the same device,
-measured beside it: absolute figures of a shared machine move by 2 to 4 within the hour."""
+"""Measures the throughput of every kernel, and its ratio to the multiply-adds and the memory bandwidth of the same
+device. These yardsticks run next to each case, since absolute figures of a shared machine vary by a factor of 2 to 4
+within the hour."""
 from __future__ import annotations
 
 import math
@@ -31,16 +32,16 @@ from whitefurnace.sphere.environments import environment
 from whitefurnace.sphere.grids import Shape, latlong_tables
 
 RUNS = 7
-"""Runs of a case after one that is not counted; the median stands for all."""
+"""Number of runs of a case after one that does not count. The median is stated."""
 
 LEAST_SECONDS = 0.02
-"""A run grows until the device works this long: a hundred times what starting a launch takes on a CPU."""
+"""Shortest run. Work grows until the device takes this long, a hundred times the start of a launch on a CPU."""
 
 GROUPS = 4096
-"""Groups of a yardstick: many for each of the cores, so that none waits long for the last."""
+"""Number of work groups of a yardstick: many for each core, so that none waits long for the last."""
 
 STREAM_BYTES = 1 << 27
-"""An array of a bandwidth yardstick, several times the largest cache."""
+"""Bytes of an array of a bandwidth yardstick, several times the largest cache."""
 
 CHAINS, STEPS_A_ROUND = 12, 4  # as yardstick.cl has them
 
@@ -97,7 +98,7 @@ FLOPS: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Spread:
-    """A measured figure: median, least and largest of its runs."""
+    """A measured figure: the median, the smallest and the largest of its runs."""
 
     median: float
     low: float
@@ -105,13 +106,18 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
+        """The spread of the values of several runs."""
         return cls(statistics.median(values), min(values), max(values))
 
 
 @dataclass(frozen=True)
 class Work:
-    """What one run does: `run` launches it, with what `before` gave, which is not timed; `units` of work; `nbytes`,
-    every array of it read or written once."""
+    """The work of one run.
+
+    run     launches it, with the result of `before`, which is not timed
+    units   of work, in the case's unit
+    nbytes  bytes of its arrays, each read or written once
+    """
 
     run: Callable[[Any], object]
     units: float
@@ -121,8 +127,14 @@ class Work:
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel to be measured: its name, its file, the unit it is counted in, and its work on a device in a precision,
-    `scale` times as much as the least."""
+    """A kernel to measure.
+
+    kernel      its file
+    unit        in which its work is counted
+    about       one line for users
+    make        gives its work on a device, in a precision, `scale` times the smallest
+    precisions  in bits
+    """
 
     name: str
     kernel: str
@@ -134,8 +146,13 @@ class Case:
 
 @dataclass(frozen=True)
 class Throughput:
-    """A case measured: units a second, and by their median GFLOP/s (None where nothing is counted) and GB/s; the
-    medians of their ratios to a yardstick run beside each; `seconds` of a run on the device."""
+    """The result of a case.
+
+    rate       units a second
+    gflops     GFLOP/s of the median run, None where operations are not counted; `gbytes`: GB/s
+    of_peak    median ratio to the multiply-adds of the same device, `of_memory` to its bandwidth
+    seconds    of a run on the device
+    """
 
     case: str
     unit: str
@@ -151,8 +168,12 @@ class Throughput:
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What the device can do: multiply-adds in GFLOP/s by precision (an addition and a multiplication each), memory
-    read and the triad a + x·b in GB/s."""
+    """The measured limits of a device.
+
+    peak   multiply-adds in GFLOP/s by precision; each is an addition and a multiplication
+    read   GB/s of reading memory
+    triad  GB/s of a + x·b
+    """
 
     peak: Mapping[int, Spread]
     read: Spread
@@ -188,7 +209,7 @@ def _enough(device: Device, make: Callable[[int], Work], least: float) -> Work:
 
 
 class BenchMeter:
-    """The yardsticks of a device. Each call is one run; what all of them gave is in `yardstick`."""
+    """Measures the yardsticks of a device. Each call is one run; `yardstick` has the results of all."""
 
     def __init__(self, device: Device, least: float = LEAST_SECONDS, nbytes: int = STREAM_BYTES) -> None:
         self.device, self.least = device, least
@@ -209,15 +230,15 @@ class BenchMeter:
         return rate
 
     def peak(self, precision: int) -> float:
-        """GFLOP/s of multiply-adds on all cores."""
+        """GFLOP/s of multiply-adds on all cores, in one run."""
         return self._run(precision, lambda: self._multiply_adds(precision))
 
     def read(self) -> float:
-        """GB/s of memory that is read."""
+        """GB/s of reading memory, in one run."""
         return self._run("read", lambda: self._streams()[0])
 
     def triad(self) -> float:
-        """GB/s of a + x·b: two arrays read, one written."""
+        """GB/s of a + x·b, two arrays read and one written, in one run."""
         return self._run("triad", lambda: self._streams()[1])
 
     def _multiply_adds(self, precision: int) -> Work:
@@ -250,7 +271,7 @@ class BenchMeter:
                      3.0 * self.stream, 3.0 * self.stream))
 
     def yardstick(self) -> Yardstick:
-        """What was measured so far, and in RUNS runs what was not yet."""
+        """The limits measured so far; those that were not are measured in RUNS runs now."""
         measures: dict[str | int, Callable[[], float]] = {p: partial(self.peak, p) for p in self.precisions}
         for which, measure in {**measures, "read": self.read, "triad": self.triad}.items():
             while len(self._rates.get(which, [])) < RUNS:
@@ -587,7 +608,8 @@ CASES = (
 
 
 def cases(names: Sequence[str]) -> tuple[Case, ...]:
-    """The cases of these names in their order, all without a name; UsageError for an unknown one, with the nearest."""
+    """The cases of these names in their order, all cases where there are no names. Raises UsageError with the nearest
+    name."""
     known = {case.name: case for case in CASES}
     for name in names:
         if name == "tradeoff":
@@ -599,7 +621,10 @@ def cases(names: Sequence[str]) -> tuple[Case, ...]:
 
 def throughput(wanted: Sequence[Case], device: Device, meter: BenchMeter, runs: int = RUNS,
                progress: Callable[[str, float], None] | None = None) -> Iterator[Throughput]:
-    """Measures cases one after the other, in every precision the device has, each with its yardstick beside it."""
+    """Measure cases one after the other, in every precision of the device, each with its yardstick next to it.
+
+    runs: counted runs of a case. progress: called with the case and the share done.
+    """
     todo = [(case, precision) for case in wanted for precision in case.precisions if precision in meter.precisions]
     for k, (case, precision) in enumerate(todo):
         if progress:

@@ -1,5 +1,5 @@
-"""Error against time of the prefilter: every method and quality on an environment, the best of them, and what makes a
-level dear: the size of the output, of the source, and α."""
+"""Measures error against time of the prefilter: every method and quality on an environment, its Pareto front, and how
+the time depends on the size of the output, on the size of the source and on α."""
 from __future__ import annotations
 
 import math
@@ -27,8 +27,8 @@ TOLERANCES = (1e-2, 3e-3, 1e-3, 1e-4, 2e-5)
 SAMPLES = (32, 128, 512, 2048, 16384)
 RUNS = 5
 BUDGET = 3.0
-"""Seconds of one point: its runs after the first end where they have taken so long. Where the first takes longer, it is
-the only one, with kernels that cheaper points have built."""
+"""Seconds of one point. Its runs after the first end when they have taken this long. Where the first run takes longer,
+it is the only one, with kernels that cheaper points have built."""
 
 COST_TOLERANCE = QUALITIES["normal"]
 SIZES = (64, 128, 256, 512)
@@ -40,8 +40,13 @@ LEVEL = 64
 
 @dataclass(frozen=True)
 class Point:
-    """A chain by one method at one setting: seconds from texels in memory to finished levels, the `certificate` apart;
-    `error`, `worst` and `rmse` of its worst level, as stated; `front` where no other is both faster and better."""
+    """A chain by one method at one setting.
+
+    seconds              from texels in memory to finished levels, without the `certificate`
+    error, worst, rmse   stated errors of its worst level
+    evaluations          lobe evaluations; `rules`: the method of each level
+    front                True if no other point is both faster and more accurate
+    """
 
     environment: str
     method: str  # "tolerance" or "samples"
@@ -58,7 +63,7 @@ class Point:
 
     @property
     def label(self) -> str:
-        """The setting for people, with the quality that asks for it."""
+        """The setting as users give it, with the quality of the same tolerance."""
         if self.method == "samples":
             return f"{self.setting:.0f}"
         quality = {tolerance: name for name, tolerance in QUALITIES.items()}.get(self.setting)
@@ -67,7 +72,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Missed:
-    """A point or a cost (`method` is then what it is over) that could not be made, and why."""
+    """A point or a cost that could not be made, and why. For a cost, `method` is the quantity that varies."""
 
     environment: str
     method: str
@@ -77,8 +82,11 @@ class Missed:
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds at COST_TOLERANCE as one thing varies: `over` "output size" (face edge of level 0), "source rows" (of a
-    lat-long) or "alpha" (one level of LEVEL² texels)."""
+    """Seconds at COST_TOLERANCE as one quantity varies.
+
+    over   "output size" (face edge of level 0), "source rows" (of a lat-long) or "alpha" (one level of LEVEL² texels)
+    value  of that quantity
+    """
 
     environment: str
     over: str
@@ -88,8 +96,11 @@ class Cost:
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the Pareto front of (cost, error), cheapest first: those that no other one beats in one of the two
-    without losing in the other. Of equal points the first counts; NaN is on no front."""
+    """Indices of the Pareto front of (cost, error), cheapest first.
+
+    A point is on the front if no other is better in one of the two without being worse in the other. Of equal points
+    the first counts; NaN is on no front.
+    """
     best, found = math.inf, []
     for k in sorted(range(len(points)), key=lambda k: points[k]):
         cost, error = points[k]
@@ -100,19 +111,19 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def load(source: str, device: Device) -> Environment:
-    """An environment in memory: a path, or the word `demo`."""
+    """An environment in memory, from a path or the word `demo`."""
     if source == DEMO and not os.path.exists(source):
         return replace(demo(device), name=DEMO)
     return environment(source)
 
 
 def check(size: int, min_size: int) -> None:
-    """Raises UsageError for sizes that no chain has."""
+    """Check the sizes of a chain. Raises UsageError."""
     chain(size=size, min_size=min_size)
 
 
 def _repeated(measure: Callable[[], Any], runs: int, budget: float) -> list[Any]:
-    """What `measure` gave, the first time left out."""
+    """The results of `measure`, without the first."""
     begin = time.perf_counter()
     found = [measure()]
     if time.perf_counter() - begin > budget:
@@ -125,7 +136,7 @@ def _repeated(measure: Callable[[], Any], runs: int, budget: float) -> list[Any]
 
 
 def _prefilter(env: Environment, device: Device, **options: Any) -> tuple[lighting.Prefiltered, float, float]:
-    """The chain, seconds from texels to levels, and seconds of the certificate."""
+    """(chain, seconds from texels to levels, seconds of the certificate)."""
     made = lighting.prefilter(env, device=device, **options)
     return made, made.timings["source"] + made.timings["levels"], made.timings["certificate"]
 
@@ -138,7 +149,11 @@ def methods() -> list[tuple[str, float]]:
 def points(env: Environment, device: Device, *, size: int = 256, min_size: int = 16, runs: int = RUNS,
            budget: float = BUDGET, todo: Sequence[tuple[str, float]] | None = None,
            progress: Callable[[str, float], None] | None = None) -> Iterator[Point | Missed]:
-    """Every method and setting on one environment, each measured where it can be made."""
+    """Measure every method and setting on one environment; those that cannot be made are `Missed`.
+
+    size, min_size: of the chain. runs, budget: most runs and seconds of a point. todo: (method, setting) pairs, by
+    default `methods()`.
+    """
     todo = methods() if todo is None else todo
     for k, (method, setting) in enumerate(todo):
         if progress:
@@ -157,7 +172,7 @@ def points(env: Environment, device: Device, *, size: int = 256, min_size: int =
 
 
 def with_front(measured: Sequence[Point]) -> list[Point]:
-    """The points of one environment, those on the front marked."""
+    """The points of one environment, with those on the Pareto front marked."""
     best = set(front([(p.seconds.median, p.error) for p in measured]))
     return [replace(p, front=k in best) for k, p in enumerate(measured)]
 
@@ -194,7 +209,7 @@ def costs(env: Environment, device: Device, *, size: int = 256, min_size: int = 
           budget: float = BUDGET, sizes: Sequence[int] = SIZES, rows: Sequence[int] = ROWS,
           alphas: Sequence[float] = ALPHAS,
           progress: Callable[[str, float], None] | None = None) -> Iterator[Cost | Missed]:
-    """What a chain costs from `sizes` and `rows` of the source, and a level over α, at COST_TOLERANCE."""
+    """Measure the seconds of a chain over output sizes and source rows, and of a level over α, at COST_TOLERANCE."""
 
     def whole(some: Environment, size: int) -> float:
         return _prefilter(some, device, tolerance=COST_TOLERANCE, size=size, min_size=min(min_size, size), certify=0)[1]

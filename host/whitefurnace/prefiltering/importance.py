@@ -162,7 +162,8 @@ def light_samples(lobe: Lobe, count: int) -> tuple[np.ndarray, np.ndarray, np.nd
         D = lobe.density(4 * half)
         sine, z = 2 * np.sqrt(half * (1 - half)), 1 - 2 * half
         share = z * np.sign(D)
-        # Next to a step of the table, D = 0 would mean a solid angle larger than the sphere. It is read from the last level.
+        # Next to a step of the table, D = 0 would mean a solid angle larger than the sphere. Such a sample is read from
+        # the last level.
         solid_angle = 8 * math.pi * energy[-1] / (count * np.maximum(np.abs(D), energy[-1] * 1e-12))
     return np.stack([sine * np.cos(phi), sine * np.sin(phi), z], 1), share / share.sum(), solid_angle
 

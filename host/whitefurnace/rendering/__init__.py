@@ -1,1 +1,1 @@
-"""Renders spheres as an engine shades them, beside the full reflectance integral."""
+"""Renders spheres as an engine shades them, and the full reflectance integral of the same pixels."""

@@ -1,4 +1,4 @@
-"""The engine's picture, the full integral and their difference, as a PNG."""
+"""Draws the engine's picture, the full integral and their difference as a PNG."""
 from __future__ import annotations
 
 import textwrap
@@ -13,10 +13,10 @@ from whitefurnace.plot_style import colours_named, drawing
 
 def draw_side_by_side(path: Path, pictures: Sequence[np.ndarray], difference: np.ndarray, scale: float, engine: str,
                 caption: Sequence[str], stated: Mapping[str, str]) -> None:
-    """Two pictures (h, w, 3) in [0, 1], the engine's and the truth, and the map (h, w) of what they differ by, NaN
-    where it is of nothing, its colours from -scale to scale: pixel by pixel, one below the other where they are wide.
+    """Draw the engine's picture, the truth and the map of their difference, one below the other where they are wide.
 
-    `stated` goes into the file's text. Raises as `draw` does.
+    pictures: two (h, w, 3) in [0, 1], shown pixel by pixel. difference: (h, w), NaN where there is none; its colours
+    span -scale to scale. caption: lines below. stated: goes into the file's text. Raises the errors of `drawing`.
     """
     high, wide = difference.shape
     head, gap, bar, dpi = 34, 12, 84, 100

@@ -1,5 +1,5 @@
-"""Spheres, of roughness across and metalness down or of a scene's materials, shaded from an engine's own files as that
-engine does it."""
+"""Shades spheres from an engine's own files as that engine does: a grid of roughness and metalness, or a scene's
+materials."""
 from __future__ import annotations
 
 import math
@@ -35,12 +35,14 @@ from whitefurnace.sphere import octahedral_map as octamap
 
 @dataclass(frozen=True)
 class Lights:
-    """What an engine's files of one environment hold, as its GPU has it: in the stored axes, formats decoded.
+    """The content of an engine's files of one environment, as its GPU has it: in the stored axes, with formats decoded.
 
     levels      the specular chain, each (6, s, s, 3), or octahedral (s, s, 3) with `border` texels around it
     irradiance  (6, s, s, 3) E/π, None where the engine has no such cube
     sh          (9, 3) in the engine's scaling (`Engine.sh`), None where it uses none
-    dfg         (h, w, 2 | 3 | 4), row 0 at v = 0, None where the engine has no table: then `karis` stands for it
+    dfg         (h, w, 2 | 3 | 4), row 0 at v = 0, None where the engine has no table and `karis` replaces it
+    read        paths of the files
+    notices     sentences for users
     """
 
     levels: tuple[np.ndarray, ...]
@@ -57,13 +59,15 @@ class Lights:
 
 def shade(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, base_color: Any, metalness: Any,
           roughness: Any, insulator: Any = DIELECTRIC) -> np.ndarray:
-    """(m, 3) linear radiance towards v of points with normals n, both unit vectors (3, m) of the world with n·v > 0,
-    lit by the environment alone.
+    """Radiance (m, 3) of surface points towards the viewer, lit by the environment alone, as the engine shades them.
 
-    `base_color` (3,) or (m, 3), `metalness` and perceptual `roughness` numbers or (m,), all in [0, 1]; `insulator` is
-    F0 of what is no metal, a number, (3,) or (m, 3). What is read, where, and how it is weighed is the engine's:
-    lod(r), direction, axes, seamless trilinear reads, its irradiance, its table bilinearly on its own axes, its way of
-    keeping energy (`SHADINGS`). Everything is linear in what is stored.
+    n, v: unit normals and view directions (3, m) in world axes, with n·v > 0. base_color: (3,) or (m, 3) in [0, 1].
+    metalness, roughness: numbers or (m,) in [0, 1]; the roughness is perceptual. insulator: F0 of the insulating part,
+    a number, (3,) or (m, 3).
+
+    The engine decides what is read, where, and how it is weighted: its lod(r), direction and axes, seamless trilinear
+    reads, its irradiance, its table read bilinearly on its own axes, and its energy compensation (`SHADINGS`). The
+    result is linear in the stored values.
     """
     m = n.shape[1]
     r = np.maximum(np.broadcast_to(np.asarray(roughness, np.float64), (m,)), engine.least)
@@ -80,13 +84,14 @@ def shade(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, base_col
 
 
 def lods(engine: Engine, roughness: np.ndarray, levels: int, width: int) -> np.ndarray:
-    """The lod in [0, levels - 1] that is read for perceptual roughnesses (m,)."""
+    """The lod in [0, levels - 1] that the engine reads for perceptual roughness values (m,). width: face edge of level
+    0."""
     lod = engine.lod_formula(r=roughness, alpha=roughness**2, max_lod=levels - 1, width=width)
     return np.clip(np.broadcast_to(lod, np.shape(roughness)), 0, levels - 1)
 
 
 def looked_up(engine: Engine, n: np.ndarray, v: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """(3, m) world directions in which the chain is read: the mirror direction, bent towards the normal."""
+    """World directions (3, m) in which the engine reads the chain: the mirror direction, bent towards the normal."""
     mirror = 2 * (n * v).sum(0) * n - v
     bend = engine.bend_formula(r=roughness, alpha=roughness**2)
     d = mirror + (n - mirror) * bend
@@ -94,17 +99,18 @@ def looked_up(engine: Engine, n: np.ndarray, v: np.ndarray, roughness: np.ndarra
 
 
 def stored_directions(engine: Engine, d: np.ndarray) -> np.ndarray:
-    """(3, m) directions on the stored cube of world directions (3, m)."""
+    """World directions d (3, m) in the axes of the stored cube, (3, m)."""
     return np.asarray(engine.matrix, np.float64) @ d
 
 
 def level(texels: np.ndarray, d: np.ndarray, border: int = 1) -> np.ndarray:
-    """(m, 3): a level read bilinearly in stored directions (3, m): a cube (6, s, s, 3), or an octahedral map."""
+    """A level read bilinearly in stored directions d (3, m): (m, 3). texels: a cube (6, s, s, 3), or an octahedral map.
+    """
     return bilinear(texels, d) if texels.ndim == 4 else octamap.read_bilinear(texels.astype(np.float64), d, border)
 
 
 def trilinear(levels: Sequence[np.ndarray], d: np.ndarray, lod: np.ndarray, border: int = 1) -> np.ndarray:
-    """(m, 3): a chain read in stored directions (3, m), bilinear in two levels and linear between them."""
+    """A chain read in stored directions d (3, m), bilinear in two levels and linear between them: (m, 3)."""
     value = np.zeros((d.shape[1], 3))
     for k, texels in enumerate(levels):
         weight = np.maximum(1 - np.abs(lod - k), 0)
@@ -115,13 +121,14 @@ def trilinear(levels: Sequence[np.ndarray], d: np.ndarray, lod: np.ndarray, bord
 
 
 def specular(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """(m, 3): prefiltered radiance as the engine reads it."""
+    """Prefiltered radiance (m, 3) as the engine reads it for normals n, views v and perceptual roughness values (m,).
+    """
     lod = lods(engine, roughness, len(lights.levels), lights.levels[0].shape[1])
     return trilinear(lights.levels, stored_directions(engine, looked_up(engine, n, v, roughness)), lod, lights.border)
 
 
 def irradiance(engine: Engine, lights: Lights, n: np.ndarray) -> np.ndarray:
-    """(m, 3): E/π at normals (3, m), from the harmonics, the cube or, as in three.js, the level of r = 1."""
+    """E/π (m, 3) at normals n (3, m), from the harmonics, the cube or, as in three.js, the level of r = 1."""
     d = stored_directions(engine, n)
     if engine.sh is not None and lights.sh is not None:
         return np.maximum(harmonic.irradiance_at(harmonic.unscaled(lights.sh, engine.sh), d), 0)
@@ -133,7 +140,8 @@ def irradiance(engine: Engine, lights: Lights, n: np.ndarray) -> np.ndarray:
 
 def split_sum(engine: Engine, dfg: np.ndarray | None, NoV: np.ndarray,
               roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B), each (m,), of E = F0·A + B with F90 = 1, of the engine's table whatever form it has."""
+    """The terms (A, B), (m,) each, of E = F0·A + B with F90 = 1, read from the engine's table in its own form; from
+    `karis` where dfg is None."""
     if dfg is None:
         return karis(NoV, roughness)
     height, width = dfg.shape[:2]
@@ -157,27 +165,30 @@ def split_sum(engine: Engine, dfg: np.ndarray | None, NoV: np.ndarray,
 
 
 def karis(NoV: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(A, B) by the fit of [Karis2014], for engines without a table of ours. It is of the masking that Unreal Engine 4
-    had: under height-correlated Smith E of F0 = 1 is up to .51 more, where it is rough and seen at grazing angles."""
+    """The terms (A, B) of the split sum by the fit of [Karis2014], for engines without a table of ours.
+
+    The fit is for the masking of Unreal Engine 4 at the time. Under height-correlated Smith masking the albedo for F0 =
+    1 is up to .51 larger, on rough surfaces at grazing angles.
+    """
     x, y = 1 - roughness, 0.0425 - 0.0275 * roughness
     a004 = np.minimum(x * x, np.exp2(-9.28 * NoV)) * x + y
     return -1.04 * a004 + 1.04 - 0.572 * roughness, 1.04 * a004 + 0.022 * roughness - 0.04
 
 
 Weights = tuple[np.ndarray, np.ndarray]
-"""Of the specular radiance and of E/π, each (m, 3)."""
+"""Weights of the specular radiance and of E/π, (m, 3) each."""
 
 
 def _split_sum(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
                NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
-    """[Karis2013]: nothing is given back of what single scattering loses."""
+    """[Karis2013]: the energy that single scattering loses stays lost."""
     E = (insulator + (color - insulator) * metal) * A + B
     return E, color * (1 - metal) * (1 - E)
 
 
 def _scaled(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
             NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
-    """Filament: E · (1 + F0 (1/E₁ - 1)) with E₁ = A + B, that of F0 = 1; what is left for the diffuse is 1 - E."""
+    """Filament: E · (1 + F0 (1/E₁ - 1)) with E₁ = A + B, the albedo for F0 = 1; the diffuse term gets 1 - E."""
     F0 = insulator + (color - insulator) * metal
     E = F0 * A + B
     return E * (1 + F0 * (1 / (A + B) - 1)), color * (1 - metal) * (1 - E)
@@ -185,14 +196,14 @@ def _scaled(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, 
 
 def _babylon(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
              NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
-    """Babylon.js 9: the same scaling; the diffuse keeps all but F0 of what arrives, whatever the specular takes, as is
-    its default (LEGACY_SPECULAR_ENERGY_CONSERVATION)."""
+    """Babylon.js 9: as Filament for the specular term. The diffuse term gets 1 - F0 of the light, whatever the specular
+    term takes, which is Babylon's default (LEGACY_SPECULAR_ENERGY_CONSERVATION)."""
     return _scaled(A, B, color, metal, r, NoV, insulator)[0], color * (1 - insulator) * (1 - metal)
 
 
 def _fdez_aguera(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
                  NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
-    """three.js and Bevy: [FdezAguera2019] for the dielectric and the metal, each alone, and mixed."""
+    """three.js and Bevy: [FdezAguera2019] for the dielectric and for the metal alone, mixed by metalness."""
     def scattered(F0: Any) -> tuple[np.ndarray, np.ndarray]:
         once, lost, average = F0 * A + B, 1 - (A + B), F0 + (1 - F0) / 21
         return once, once * average / (1 - lost * average) * lost
@@ -204,7 +215,8 @@ def _fdez_aguera(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndar
 
 def _khronos(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
              NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
-    """Khronos glTF Sample Viewer: [FdezAguera2019] with a Fresnel that depends on roughness, all times radiance."""
+    """Khronos glTF Sample Viewer: [FdezAguera2019] with a Fresnel term that depends on roughness, multiplied by
+    radiance."""
     def fresnel(F0: Any) -> np.ndarray:
         k = F0 + (np.maximum(1 - r, F0) - F0) * (1 - NoV) ** 5
         once, lost, average = k * A + B, 1 - (A + B), F0 + (1 - F0) / 21
@@ -216,17 +228,18 @@ def _khronos(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray,
 
 SHADINGS: Mapping[str, Callable[..., Weights]] = {
     "split_sum": _split_sum, "scaled": _scaled, "babylon": _babylon, "fdez_aguera": _fdez_aguera, "khronos": _khronos}
-"""By `Engine.shading`: weights of radiance and of E/π from (A, B, base colour, metalness, r, NoV, F0 of insulators)."""
+"""By `Engine.shading`, a function from (A, B, base colour, metalness, r, NoV, F0 of insulators) to the weights of
+radiance and of E/π."""
 
 
 # ------------------------------------------------------------------------------------------------- files
 
 
 def read_lights(engine: Engine, folder: str | os.PathLike[str], stem: str) -> Lights:
-    """What the files STEM… of a bake for `engine` in `folder` (DIR/ENGINE) hold, read back from them.
+    """The content of an engine's files of a bake, read back from them.
 
-    Raises FileError and InputError for files that are missing or not valid, UnsupportedError for an engine that is
-    given no chain and for formats that are not decoded.
+    folder: DIR/ENGINE. stem: the files' common stem. Raises FileError and InputError for files that are missing or not
+    valid, UnsupportedError for an engine that gets no prefiltered chain and for formats that are not decoded.
     """
     folder = Path(folder)
     if engine.container != "files":
@@ -272,7 +285,7 @@ def read_lights(engine: Engine, folder: str | os.PathLike[str], stem: str) -> Li
 
 
 def _read_everything(engine: Engine, folder: Path, stem: str) -> Lights:
-    """Of `raw` and `exr`: our own, with a cube of E/π and the table of (A, B)."""
+    """The content of a bake for `raw` or `exr`, with a cube of E/π and the table of (A, B)."""
     if engine.container == "npz":
         path = folder / f"{stem}.npz"
         held = read_npz(path)
@@ -300,7 +313,7 @@ def _read_everything(engine: Engine, folder: Path, stem: str) -> Lights:
 
 
 def _texels(path: Path, *, cube: bool) -> tuple[np.ndarray, ...]:
-    """The levels of a texture, three channels where it is a cube. Raises InputError for another shape."""
+    """The levels of a texture, with three channels if it is a cube. Raises InputError for another shape."""
     texture = read_texture(path)
     if texture.cube != cube or texture.layers:
         raise InputError(f"{path} is not a single {'cube' if cube else '2-D image'}")
@@ -341,9 +354,9 @@ def _table(file: File, path: Path) -> np.ndarray:
 
 
 def engine_in(manifest: str | os.PathLike[str], name: str) -> tuple[Engine, Path, str]:
-    """The engine, its folder and the stem of a bake, by its manifest; the preset as it was when it was baked.
+    """(engine, its folder, stem) of a bake, from its manifest. The preset is the one that it was baked with.
 
-    Raises InputError for what is no manifest of a bake or lists files that are not there as they were written,
+    Raises InputError for a file that is no manifest of a bake, or that lists files which are missing or changed;
     UsageError for an engine that it was not baked for.
     """
     path = Path(manifest)
@@ -377,6 +390,7 @@ def _listed(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def dictionary(value: Any) -> dict[str, Any]:
+    """The value if it is a dictionary, else an empty one."""
     return value if isinstance(value, dict) else {}
 
 
@@ -386,19 +400,25 @@ SIZE_RANGE = (8, 2048)
 MOST_PIXELS = 1 << 26
 EXPOSURES = 64.0
 RADIUS = 0.45
-"""Of a sphere, in edges of its cell."""
+"""Radius of a sphere, in edges of its cell."""
 
 VIEW = math.radians(60)
-"""Vertical angle of the camera that sees the background; the spheres are seen in parallel, from +z."""
+"""Vertical angle of the camera that sees the background, in radians. The spheres are seen in parallel, from +z."""
 
 GREY = 0.18
-"""Of a plain background, linear."""
+"""Linear value of a plain background."""
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """A picture that was written: `roughness` of its columns and `metalness` of its rows, or, of a scene, `materials`:
-    each one's name, row and column, and what its sphere is made of."""
+    """A picture that was written.
+
+    width, height         pixels
+    roughness, metalness  of the columns and of the rows of a grid
+    exposure              stops
+    read                  paths of the files that were read
+    materials             of a scene: each material's name, row, column and the values of its sphere
+    """
 
     path: Path
     engine: str
@@ -413,8 +433,11 @@ class Rendered:
 
 
 def sphere(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of a cell of size² pixels: the flat indices (m,) of those that a sphere covers, how much of each, and the normals
-    (3, m) there, seen from +z. A pixel at the rim, its centre maybe beside the sphere, has the normal of the rim."""
+    """The pixels of a cell of size² pixels that a sphere covers: flat indices (m,), coverage (m,) in [0, 1], and
+    normals (3, m).
+
+    The sphere is seen from +z. A pixel at the rim, whose centre may lie outside the sphere, has the normal of the rim.
+    """
     radius = RADIUS * size
     at = (np.arange(size) + 0.5 - size / 2) / radius
     x, y = np.tile(at, size), np.repeat(-at, size)
@@ -429,15 +452,21 @@ def sphere(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def grid(engine: Engine, lights: Lights, *, columns: int = 7, rows: int = 3, size: int = 128,
          base_color: Sequence[float] = (1.0, 1.0, 1.0), background: str = "environment") -> np.ndarray:
-    """(rows · size, columns · size, 3) linear radiance: spheres of roughness 0 … 1 from left to right and metalness
-    0 … 1 from the top down (1 where there is one row), seen along -z, over the image itself or a plain grey."""
+    """A picture of spheres, (rows · size, columns · size, 3) linear radiance, seen along -z.
+
+    Roughness goes from 0 to 1 from left to right, metalness from 0 to 1 from the top down (1 where there is one row).
+    size: pixels of a sphere's cell. base_color: of all spheres, in [0, 1]. background: "environment" for the image,
+    "plain" for grey. Raises UsageError for values out of range.
+    """
     return drawn(engine, lights, of_grid(columns, rows, base_color), size=size, background=background)
 
 
 def drawn(engine: Engine, lights: Lights, spheres: SphereLayout, *, size: int = 128,
           background: str = "environment") -> np.ndarray:
-    """(rows · size, columns · size, 3) linear radiance of spheres row by row, as `grid`; where the last row has fewer,
-    the rest is background."""
+    """A picture of a layout of spheres, (rows · size, columns · size, 3) linear radiance, as `grid`.
+
+    Where the last row has fewer spheres, the rest is background. Raises UsageError for values out of range.
+    """
     columns, rows = spheres.columns, spheres.rows
     in_range("size", size, SIZE_RANGE)
     if columns * rows * size * size > MOST_PIXELS:
@@ -459,7 +488,7 @@ def drawn(engine: Engine, lights: Lights, spheres: SphereLayout, *, size: int = 
 
 
 def camera(shape: tuple[int, ...], band: slice = slice(None)) -> np.ndarray:
-    """(3, m) world directions of the pixels in those rows of a picture, of a camera that looks along -z with +y up."""
+    """World directions (3, m) of the pixels in the rows `band` of a picture. The camera looks along -z with +y up."""
     height, width = shape[:2]
     scale = 2 * math.tan(VIEW / 2) / height
     x = (np.arange(width) + 0.5 - width / 2) * scale
@@ -469,13 +498,13 @@ def camera(shape: tuple[int, ...], band: slice = slice(None)) -> np.ndarray:
 
 
 def _behind(engine: Engine, lights: Lights, shape: tuple[int, ...], band: slice) -> np.ndarray:
-    """What the camera sees of level 0 in those rows of a picture."""
+    """Level 0 as the camera sees it in the rows `band` of a picture."""
     d = stored_directions(engine, camera(shape, band))
     return level(lights.levels[0], d, lights.border).reshape(-1, shape[1], 3)
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear values as a picture shows them, [0, 1]: what is above 1 is 1, no tone curve. [IEC 61966-2-1]"""
+    """Linear values as sRGB in [0, 1], without a tone curve: values above 1 become 1 [IEC 61966-2-1]."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
@@ -484,11 +513,14 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
            columns: int = 7, rows: int | None = None, exposure: float = 0.0,
            base_color: Sequence[float] | None = None, background: str = "environment",
            scene: str | os.PathLike[str] | None = None, force: bool = False) -> Rendered:
-    """Draw the spheres of a bake for one engine into a PNG, in sRGB: radiance times 2^exposure, clipped at 1.
+    """Draw the spheres of a bake for one engine into a PNG in sRGB, as radiance times 2^exposure, clipped at 1.
 
-    rows: 3 by default, and base_color 1 1 1: of the grid alone. scene: a glTF whose materials are drawn in its place.
-    Raises UsageError for what is out of its range or an engine that was not baked for, FileError, InputError and
-    UnsupportedError as `engine_in`, `read_lights` and `read_scene` do.
+    manifest: of the bake. for_: the engine. size: pixels of a sphere's cell. columns, rows: of the grid; 3 rows by
+    default. base_color: of the grid, 1 1 1 by default. exposure: stops. background: "environment" or "plain". scene: a
+    glTF file whose materials are drawn in place of the grid. force: replace an existing file.
+
+    Raises UsageError for a value out of range or an engine that was not baked for, and the FileError, InputError and
+    UnsupportedError of `engine_in`, `read_lights` and `read_scene`.
     """
     output = Path(output)
     if output.suffix.lower() != ".png":

@@ -1,4 +1,5 @@
-"""An engine's picture of spheres beside the full reflectance integral of the same pixels, and what they differ by."""
+"""Draws an engine's picture of spheres, the full reflectance integral of the same pixels, and their difference side by
+side."""
 from __future__ import annotations
 
 import math
@@ -34,37 +35,38 @@ TOLERANCE = 1e-2
 TOLERANCE_RANGE = (1e-4, 0.5)
 
 IRRADIANCE = 128
-"""Texels a face edge of the cube of E/π that a Lambertian is read from: bilinear reads err by 2e-5 of its range."""
+"""Texels a face edge of the cube of E/π from which a Lambertian surface is read. Bilinear reads err by 2e-5 of its
+range."""
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
-"""Of linear Rec.709."""
+"""Weights of linear Rec.709 in luminance."""
 
 DARK = 1e-3
-"""Of the mean radiance: differences are over the luminance of the truth, or over this where it is less."""
+"""Floor of the truth's luminance that differences are divided by, over the mean radiance."""
 
 MOST = 0.95
-"""Part of the spheres' pixels that the scale of differences reaches over."""
+"""Share of the spheres' pixels that the scale of differences covers."""
 
 SUFFIXES = (".png", ".exr")
 
 MIRROR = 1 / 64
-"""Roughness below which truth is a mirror: its lobe, α = 2.4e-4, is narrower than a texel of an image of 16K."""
+"""Roughness below which the truth is a mirror: its lobe, α = 2.4e-4, is narrower than a texel of an image of 16K."""
 
 Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Material:
-    """What all spheres are made of, each a swatch of it, in the metallic-roughness model of glTF 2.0.
+    """The reflection model of all spheres, the metallic-roughness model of glTF 2.0.
 
-    The specular part has the NDF, Smith's masking and F = (1 - metalness) F_d + metalness F_m, Schlick's of the
-    swatch's insulator and of F0 = base colour where no other `dielectric` and `metal` are given. The diffuse part is
-    (1 - metalness) times what a `diffuse` model of that base colour reflects, Lambert's where none is given, times
-    1 - E_d(v), E_d the directional albedo of the specular part under F_d: it gets what the specular leaves, as in the
+    The specular part has the NDF, Smith's masking and F = (1 - metalness) F_d + metalness F_m. Without `dielectric` and
+    `metal` these are Schlick's, of the sphere's insulator and of F0 = base colour. The diffuse part is (1 - metalness)
+    times the reflection by a `diffuse` model of the base colour, Lambert's by default, times 1 - E_d(v), where E_d is
+    the directional albedo of the specular part under F_d. So it gets the light that the specular part leaves, as in the
     engines.
 
-    Facets scatter once. `multiscatter` gives back what is lost by that, as most engines do: the specular part times
-    1 + F0 (1/E₁ - 1), E₁ the albedo of F = 1 and F0 the Fresnel at n = v. [Turquin2019]
+    Facets scatter once. `multiscatter` gives back the lost energy as most engines do: the specular part is multiplied
+    by 1 + F0 (1/E₁ - 1), where E₁ is the albedo of F = 1 and F0 the Fresnel term at n = v [Turquin2019].
     """
 
     ndf: Spec = "ggx"
@@ -75,7 +77,8 @@ class Material:
     multiscatter: bool = False
 
     def terms(self, roughness: float) -> dict[str, Term]:
-        """By what they are of: "both" Schlick's, where linear in F0, or "dielectric" and "metal"."""
+        """The terms of the specular part at a roughness: "both" for Schlick's, linear in F0, or "dielectric" and
+        "metal"."""
         base: dict[str, Any] = {"ndf": self.ndf, "masking": self.masking, "roughness": roughness}
         found = {}
         if self.dielectric is None or self.metal is None:
@@ -88,7 +91,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Certified:
-    """One pixel held against the quadrature: its roughness, n·v, the variant and the error over its value."""
+    """One pixel compared with the quadrature: its roughness, n·v, the variant, both values and the relative error."""
 
     roughness: float
     NoV: float
@@ -100,9 +103,16 @@ class Certified:
 
 @dataclass(frozen=True)
 class Shown:
-    """`engine`, `truth` and `difference` (h, w, 3), linear; `difference` is engine - truth over the luminance of the
-    truth, 0 beside the spheres. `samples` a pixel and `estimates` of their error by `roughness`, that of each column or
-    each other one of a scene, and the certificate."""
+    """The pictures of an engine, of the truth and of their difference.
+
+    engine, truth, difference  (h, w, 3), linear; the difference is (engine - truth) over the luminance of the
+                               truth, and 0 outside the spheres
+    samples, estimates         samples a pixel and the estimated error of the truth, for each value of `roughness`
+    certificate                pixels compared with the quadrature
+    seconds                    wall time by activity
+    covered                    (h, w) bool, pixels that a sphere covers
+    roughness                  of each column of a grid, or the distinct ones of a scene
+    """
 
     engine: np.ndarray
     truth: np.ndarray
@@ -116,22 +126,22 @@ class Shown:
 
     @property
     def luminance(self) -> np.ndarray:
-        """(h, w): the difference of luminances."""
+        """Difference of luminances, (h, w)."""
         return np.asarray(self.difference @ LUMINANCE)
 
     def within(self, share: float) -> float:
-        """The relative difference that a share of the spheres' pixels is within."""
+        """The largest relative difference among the best `share` of the spheres' pixels."""
         return float(np.quantile(np.abs(self.luminance[self.covered]), share))
 
     @property
     def error(self) -> float:
-        """The worst of the certificate; NaN without one."""
+        """The largest error of the certificate, NaN without one."""
         return max((c.error for c in self.certificate), default=math.nan)
 
 
 @dataclass(frozen=True)
 class Rendered(rendering.Rendered):
-    """A picture of three panels, and what is stated of it."""
+    """A picture of three panels, with the errors and samples that are stated with it."""
 
     source: str = ""
     tolerance: float = TOLERANCE
@@ -150,7 +160,7 @@ class Rendered(rendering.Rendered):
 
 
 class Spheres:
-    """The truth of points of spheres in one environment and under further lights."""
+    """The true radiance of points on spheres in one environment and under further lights."""
 
     def __init__(self, truth: Truth, material: Material, points: Points, lights: Sequence[Spec] = ()) -> None:
         self.truth, self.material, self.points = truth, material, points
@@ -160,8 +170,11 @@ class Spheres:
 
     def alike(self, roughness: float, spheres: Sequence[MaterialSphere], tolerance: float,
               ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
-        """Of one roughness: for each swatch (m, 3) by the environment and (m, 3) by the further lights, the samples a
-        point and the estimate of their error, and the terms."""
+        """The truth of spheres of one roughness.
+
+        Returns ((m, 3) by the environment for each sphere, (m, 3) by the further lights for each, samples a point,
+        their estimated error, terms). tolerance: of the 99th percentile of the specular part's errors.
+        """
         truth, points = self.truth, self.points
         found = self.material.terms(roughness)
         lost = self._lost(roughness)
@@ -199,7 +212,7 @@ class Spheres:
         return pictures, extras, max(counts), max(estimates), found
 
     def _lost(self, roughness: float) -> np.ndarray:
-        """(m,) 1/E₁ - 1, 0 where nothing is given back."""
+        """1/E₁ - 1, (m,); 0 where multiple scattering is not given back."""
         if not self.material.multiscatter or roughness == 0:
             return np.zeros(self.points.n.shape[1])
         one = term(ndf=self.material.ndf, masking=self.material.masking, roughness=roughness)
@@ -207,12 +220,12 @@ class Spheres:
 
     @cached_property
     def _lambert(self) -> np.ndarray:
-        """(m, 3) E/π of the environment."""
+        """E/π (m, 3) of the environment."""
         cube = irradiance(self.truth.env, size=IRRADIANCE, device=self.truth.device).values
         return bilinear(cube, self.points.n)
 
     def diffuse(self, base_color: Triple) -> np.ndarray:
-        """(m, 3): what the diffuse model reflects of the environment, base colour and all."""
+        """Reflection (m, 3) of the environment by the diffuse model, base colour included."""
         truth, points = self.truth, self.points
         if self.material.diffuse is None:
             return np.asarray(self._lambert * np.asarray(base_color, np.float64))
@@ -231,7 +244,7 @@ class Spheres:
         return Term(found.models, {name: np.broadcast_to(v, (3,)) for name, v in found.parameters.items()})
 
     def diffuse_lit(self, base_color: Triple) -> np.ndarray:
-        """(m, 3) of the further lights."""
+        """Reflection (m, 3) of the further lights by the diffuse model, base colour included."""
         if not self.lights:
             return np.zeros((self.points.n.shape[1], 3))
         if base_color not in self._diffuse_lit:
@@ -240,7 +253,7 @@ class Spheres:
         return self._diffuse_lit[base_color]
 
     def lit(self, found: Term) -> np.ndarray:
-        """(m, S, 3): what the further lights give under a term, in closed form or along their outlines."""
+        """Reflection (m, S, 3) of the further lights under a term, in closed form or along their outlines."""
         points, total = self.points, np.zeros((self.points.n.shape[1], found.sets, 3))
         own = {name: np.broadcast_to(v, (found.sets,)) for name, v in found.parameters.items()}
         models: dict[str, Any] = dict(found.models)
@@ -263,17 +276,17 @@ class Spheres:
 
 
 def _facing() -> Points:
-    """One point whose normal is the view."""
+    """One point whose normal is the view direction."""
     up = np.array([[0.0], [0.0], [1.0]])
     return Points(up, up)
 
 
 def in_frame(light: Chosen, given: Mapping[str, float], points: Points) -> dict[str, np.ndarray]:
-    """A light's parameters, (m,) each, in the frame of every point: its n is +z and v has the azimuth 0.
+    """A light's parameters, (m,) each, in the frame of every point, where n is +z and v has the azimuth 0.
 
-    They are given in that of the sphere's middle, which is the frame of a surface that faces the viewer: +z towards the
-    viewer, +x to the right, lengths in radii. What is named NAME_x, NAME_y, NAME_z is a vector, a `center` a place; NoL
-    and phi_l are a direction. Raises UsageError for a parameter that is missing.
+    given: parameters in the frame of the sphere's middle, a surface that faces the viewer: +z towards the viewer, +x to
+    the right, lengths in radii. NAME_x, NAME_y, NAME_z are a vector, and `center` is a place; NoL and phi_l are a
+    direction. Raises UsageError for a parameter that is missing.
     """
     model, m = light.model, points.n.shape[1]
     values = {**{p.name: p.default for p in model.parameters if p.default is not None}, **given}
@@ -300,9 +313,9 @@ def in_frame(light: Chosen, given: Mapping[str, float], points: Points) -> dict[
 
 
 def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], device: Device) -> Environment:
-    """The environment of a bake as the bake had it: turned, exposed and without its sun as the manifest says.
+    """The environment of a bake, turned, exposed and without its sun as its manifest says.
 
-    Raises InputError where its digest is not the one in the manifest, and what `environment` raises.
+    Raises InputError where the image's digest is not the one in the manifest, and the errors of `environment`.
     """
     written = rendering.dictionary(read_manifest(Path(manifest)))
     recipe, source = rendering.dictionary(written.get("recipe")), rendering.dictionary(written.get("source"))
@@ -320,7 +333,7 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
 
 
 def ndf_of(manifest: str | os.PathLike[str]) -> Spec:
-    """The NDF that a bake was filtered with. Raises UsageError for one from a file."""
+    """The NDF with which a bake was filtered. Raises UsageError for one from a file."""
     ndf = rendering.dictionary(rendering.dictionary(read_manifest(Path(manifest))).get("recipe")).get("ndf", "ggx")
     if isinstance(ndf, str):
         return ndf
@@ -335,12 +348,12 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
            layout: SphereLayout, *, size: int = 128, background: str = "environment", tolerance: float = TOLERANCE,
            certify: int = 1, further: Sequence[Spec] = (),
            progress: Callable[[str, float], None] | None = None) -> Shown:
-    """The spheres of `rendering.drawn` as the engine shows them, in truth, and their difference. What is smoother than
-    MIRROR is one in truth.
+    """The spheres of `shading.drawn` as the engine shows them, in truth, and their difference.
 
-    tolerance: of the 99th percentile of errors of the specular part of each roughness, over its value or 1e-3 of the
-    mean radiance. certify: pixels of each roughness that are held against the quadrature. further: lights besides the
-    environment, which are added to both pictures alike. Raises as `rendering.drawn` does.
+    material: the reflection model of the truth; roughness below MIRROR is a mirror in it. tolerance: of the 99th
+    percentile of errors of the specular part of each roughness, over its value or 1e-3 of the mean radiance. certify:
+    pixels of each roughness that are compared with the quadrature. further: lights that are added to both pictures
+    alike. Raises the errors of `shading.drawn`.
     """
     begin = time.perf_counter()
     shown = rendering.drawn(engine, lights, layout, size=size, background=background)
@@ -387,7 +400,7 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
 
 
 def _over(cell: np.ndarray, index: np.ndarray, cover: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """A cell (size, size, c) with values (m, c) laid over it."""
+    """A cell (size, size, c) with values (m, c) over it."""
     flat = cell.reshape(-1, cell.shape[-1]).copy()
     flat[index] += (values - flat[index]) * cover[:, None]
     return flat.reshape(cell.shape)
@@ -412,8 +425,8 @@ def _certificate(truth: Truth, terms: Mapping[str, Term], points: Points, roughn
 
 
 def scale_of(shown: Shown) -> float:
-    """The difference at the ends of the colours: 1, 2 or 5 times a power of ten that 95 % of the spheres are within, 1
-    at most."""
+    """The difference at the ends of the colour scale: 1, 2 or 5 times a power of ten, at most 1, that 95 % of the
+    spheres' pixels are within."""
     most = shown.within(MOST)
     power = 10.0 ** math.floor(math.log10(max(most, 1e-6)))
     return min(next(k * power for k in (1, 2, 5, 10) if k * power >= most * (1 - 1e-9)), 1.0)
@@ -427,11 +440,13 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
            diffuse: Spec | None = None, multiscatter: bool = False, light: Sequence[Spec] = (),
            device: Device | str | None = None, force: bool = False,
            progress: Callable[[str, float], None] | None = None) -> Rendered:
-    """Draw the spheres of a bake for one engine, beside them the truth, and the difference: a PNG of three panels with
-    a scale, or an EXR of the layers engine, truth and difference in float32, without exposure.
+    """Draw the spheres of a bake for one engine, the truth and their difference side by side.
 
-    truth: the image that the bake was made of. The other parameters are those of `rendering.render`, `panels` and
-    `Material`; the NDF is the bake's own by default. Raises as they do, UnsupportedError for a PNG without matplotlib.
+    A PNG gets three panels with a scale. An EXR gets the layers engine, truth and difference in float32, without
+    exposure. truth: the image that the bake was made of. The other parameters are those of `shading.render`, `panels`
+    and `Material`; the NDF is the bake's own by default.
+
+    Raises their errors, and UnsupportedError for a PNG without matplotlib.
     """
     output = Path(output)
     if output.suffix.lower() not in SUFFIXES:
@@ -488,7 +503,7 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
 
 
 def _stated(made: Rendered) -> dict[str, str | float | int]:
-    """What is stored with the picture."""
+    """Values that are stored with the picture."""
     return {"engine": made.engine, "source": made.source, "tolerance": made.tolerance, "error": made.error,
             "certified": len(made.certificate), "samples": " ".join(map(str, made.samples)),
             "difference_median": made.median, "difference_95": made.most, "difference_scale": made.scale,

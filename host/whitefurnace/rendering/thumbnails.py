@@ -1,4 +1,4 @@
-"""Pictures of a bake's levels: a panorama, and spheres that mirror them, through one tone curve."""
+"""Draws thumbnails of a bake: a panorama, and spheres that mirror its levels, through one tone curve."""
 from __future__ import annotations
 
 import math
@@ -21,33 +21,39 @@ from whitefurnace.sphere.grids import cube_centres, latlong_centres
 from whitefurnace.sphere.harmonics import irradiance_at
 
 CELL = 64
-"""Pixels of a sphere's cell, and rows of the panorama: a strip of four levels has 448 × 64 pixels and 30 to 50 KB."""
+"""Pixels of a sphere's cell, and rows of the panorama. A thumbnail of four levels has 448 × 64 pixels and 30 to 50 KB.
+"""
 
 FINE = 2 * CELL
-"""Pixels that a sphere is drawn with: its rim mirrors half of the world, and each kept pixel is a mean of four."""
+"""Pixels with which a sphere is drawn. Its rim mirrors half of the world, and each pixel that is kept is a mean of
+four."""
 
 FACE = 32
-"""Texels of a face that strips are drawn from: the middle of a sphere of CELL pixels shows 25 of them."""
+"""Texels a face edge from which thumbnails are drawn. The middle of a sphere of CELL pixels shows 25 of them."""
 
 MOST_SPHERES = 12
 LOOK = 1
-"""To be raised where strips change, so that those that are there are made again."""
+"""Version of the thumbnails' look. Raise it when they change, so that existing ones are made again."""
 
 WORLD = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 Matrix = tuple[tuple[int, int, int], ...]
 
 
 def tone(linear: np.ndarray, exposure: float) -> np.ndarray:
-    """Radiance times `exposure` as a picture shows it, [0, 1] in sRGB: by the filmic curve of [Narkowicz2015],
-    x(2.51x + .03) / (x(2.43x + .59) + .14), which comes to 1 at x = 7.2 and is cut there."""
+    """Radiance times `exposure` as sRGB in [0, 1], through the filmic curve of [Narkowicz2015].
+
+    The curve is x(2.51x + .03) / (x(2.43x + .59) + .14). It reaches 1 at x = 7.2 and is cut there.
+    """
     x = np.clip(np.nan_to_num(linear) * exposure, 0, 1e6)  # its squares are numbers
     return srgb(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14))
 
 
 def exposure_of(texels: np.ndarray) -> float:
-    """What brings the middle of a level (6, s, s, 3) to a grey of .18. The middle is the log-average of luminance over
-    the sphere [Reinhard2002, eq. 1], or a quarter of the mean where that is more: rough levels, which come near the
-    mean, are then not burnt out by a lamp in a dark room or a sun."""
+    """Factor that brings the middle of a level (6, s, s, 3) to a grey of .18.
+
+    The middle is the log-average of luminance over the sphere [Reinhard2002, eq. 1], or a quarter of the mean where
+    that is more. So rough levels, whose values are near the mean, are not burnt out by a lamp in a dark room or a sun.
+    """
     luminance = np.maximum(texels.astype(np.float64) @ (0.2126, 0.7152, 0.0722), 0)
     weights = np.broadcast_to(cube_solid_angles(texels.shape[1]), luminance.shape) / (4 * math.pi)
     mean = float((luminance * weights).sum())
@@ -58,9 +64,12 @@ def exposure_of(texels: np.ndarray) -> float:
 
 
 def thumbnail(levels: Sequence[np.ndarray], matte: np.ndarray, matrix: Matrix = WORLD) -> np.ndarray:
-    """(CELL, width, 4) uint8 in sRGB, from levels (6, s, s, 3): the first as a panorama, +X in its middle, then each on
-    a metal sphere seen along -z, read in the mirror direction, and the irradiance `matte` (m, 3) at `normals()`.
-    `matrix` takes the world's directions to those of the cubes."""
+    """A picture (CELL, width, 4) uint8 in sRGB: the first level as a panorama, each level on a metal sphere, and a
+    matte sphere.
+
+    levels: cubes (6, s, s, 3). The panorama has +X in its middle; the spheres are seen along -z and mirror the level.
+    matte: irradiance (m, 3) at `normals()`. matrix: maps world directions to those of the cubes.
+    """
     cubes = [_reduced(texels) for texels in levels[:MOST_SPHERES]]
     exposure = exposure_of(cubes[0])
     index, cover, _ = sphere(FINE)
@@ -78,21 +87,20 @@ def thumbnail(levels: Sequence[np.ndarray], matte: np.ndarray, matrix: Matrix = 
 
 
 def normals() -> np.ndarray:
-    """(3, m) of the pixels of a sphere, twice as many a side as are kept."""
+    """Normals (3, m) of the pixels of a sphere, drawn with twice as many pixels a side as are kept."""
     return sphere(FINE)[2]
 
 
 def write_thumbnail(path: str | os.PathLike[str], texels: tuple[Sequence[np.ndarray], np.ndarray, Matrix]) -> None:
-    """The strip of what `read_thumbnail` gave, as a PNG. Raises FileError."""
+    """Write the thumbnail of the result of `read_thumbnail` as a PNG. Raises FileError."""
     write_png(path, thumbnail(*texels), effort=5)  # a fifth of the time of 9, for 2 to 4 % more bytes
 
 
 def read_thumbnail(manifest: Path, stated: Mapping[str, Any]) -> tuple[Sequence[np.ndarray], np.ndarray, Matrix]:
-    """Levels, irradiance and axes of a bake, from the files of the first of its engines that has a chain, `raw` first;
-    where none has one from an image. `stated` is what the manifest holds.
+    """(levels, irradiance, axes) of a bake, from the files of the first of its engines that has a chain, `raw` first.
 
-    Raises FileError and InputError for files that are missing, changed or not valid, UnsupportedError where none can be
-    decoded.
+    Where no engine has one, they come from an image. stated: the content of the manifest. Raises FileError and
+    InputError for files that are missing, changed or not valid, UnsupportedError where none can be decoded.
     """
     recipe = stated.get("recipe")
     names = recipe.get("for") if isinstance(recipe, Mapping) else None
@@ -136,13 +144,13 @@ def _harmonics(manifest: Path, stated: Mapping[str, Any]) -> np.ndarray:
 
 
 def _of_octahedral(texels: np.ndarray, border: int) -> np.ndarray:
-    """A cube of FACE² that is read from an octahedral map, in the same axes."""
+    """A cube of FACE² texels a face, read from an octahedral map in the same axes."""
     d = cube_centres(FACE, np.arange(6 * FACE * FACE))
     return level(texels, d, border).reshape(6, FACE, FACE, 3)
 
 
 def _of_latlong(texels: np.ndarray) -> np.ndarray:
-    """A cube of FACE² that is read from a lat-long image, its rows brought to 2 FACE by means of four."""
+    """A cube of FACE² texels a face, read from a lat-long image whose rows are reduced to 2 FACE by means of four."""
     while texels.shape[0] > 2 * FACE and texels.shape[0] % 2 == 0 and texels.shape[1] % 2 == 0:
         texels = _halved(texels.astype(np.float32))
     rows, columns = texels.shape[:2]
@@ -153,8 +161,8 @@ def _of_latlong(texels: np.ndarray) -> np.ndarray:
 
 
 def _reduced(texels: np.ndarray) -> np.ndarray:
-    """A cube of FACE texels a face at most, by means of four; NaN is black, and what is infinite as bright as
-    the brightest that is not."""
+    """A cube of at most FACE texels a face edge, by means of four. NaN becomes 0, and infinite values the largest
+    finite one."""
     texels = np.asarray(texels, np.float32)
     finite = np.isfinite(texels)
     if not finite.all():
@@ -165,13 +173,13 @@ def _reduced(texels: np.ndarray) -> np.ndarray:
 
 
 def _halved(texels: np.ndarray) -> np.ndarray:
-    """(…, h, w, c) as means of 2 × 2."""
+    """Means (…, h/2, w/2, c) of 2 × 2 values (…, h, w, c)."""
     return np.asarray((texels[..., ::2, ::2, :] + texels[..., 1::2, ::2, :]
                        + texels[..., ::2, 1::2, :] + texels[..., 1::2, 1::2, :]) / 4)
 
 
 def _read(texels: np.ndarray, what: str, matrix: Matrix) -> np.ndarray:
-    """(m, 3): a cube read seamlessly in the directions of `what`."""
+    """A cube read seamlessly in the directions `what` ("panorama", "mirror" or "normal"): (m, 3)."""
     index, weights = _taps(texels.shape[1], what, matrix)
     return np.asarray(np.einsum("km,kmc->mc", weights, texels.reshape(-1, 3)[index]))
 

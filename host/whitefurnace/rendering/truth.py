@@ -1,9 +1,9 @@
-"""The truth beside an engine's picture: the full reflectance integral of surface points in an environment
-[Hoffman2012, "The Reflectance Equation"], by importance sampling on the device.
+"""Computes the full reflectance integral of surface points in an environment [Hoffman2012, "The Reflectance Equation"],
+by importance sampling on the device.
 
-What an engine shows is the split sum: its levels have n = v = r, and its table no light. Here nothing is split:
-L_o(v) = ∫ L(l) f(l, v)(n·l) dω with every facet's own view, Fresnel and masking inside. `radiance.py` does the same of
-a few cells by quadrature in float64, and is what a picture's error is stated against.
+An engine shows the split sum: its levels have n = v = r, and its table knows no light. Here nothing is split: L_o(v) =
+∫ L(l) f(l, v)(n·l) dω, with every facet's own view, Fresnel and masking inside. `radiance.py` computes the same for a
+few cells by quadrature in float64; a picture's error is stated against it.
 """
 from __future__ import annotations
 
@@ -38,47 +38,50 @@ from whitefurnace.sphere.grids import (
 from whitefurnace.sphere.suns import without_sun
 
 VISIBLE = ("ggx",)
-"""NDFs that are ellipsoids, stretched by their width: the normals that v sees of them have a closed form."""
+"""NDFs that are ellipsoids stretched by their width. The normals that v sees of them have a closed form."""
 
 LIGHTS = 16384
-"""Bright lights of an environment at most: 0.2 s of two cores for a sphere of 128 pixels."""
+"""Largest number of bright lights of an environment: 0.2 s of two cores for a sphere of 128 pixels."""
 
 FINEST = 0.0035
-"""Radians: what is closer together goes as one light, where an image has more bright texels than LIGHTS."""
+"""Angle in radians within which texels become one light, where an image has more bright texels than LIGHTS."""
 
 BLOCK = 0.125
-"""Of the lobe's width: the same for wider lobes. Its error is of the second order, 1e-3 of the light's share."""
+"""The same angle for wider lobes, over the lobe's width. Its error is of the second order, 1e-3 of the light's share.
+"""
 
 NEAR = 0.5
-"""Of the lobe's width: texels larger than that are cut for it, into MOST_CUT parts of all at most."""
+"""Largest texel over the lobe's width. Larger texels are cut, into at most MOST_CUT parts together."""
 
 MOST_CUT = 8 * LIGHTS
 
 SHARPER = 0.2
-"""Of the lobe's width: the largest texels that it is read from, so that bilinear reads do not blur what it shows."""
+"""Largest texels that a lobe is read from, over its width, so that bilinear reads do not blur the result."""
 
 QUADRATURE = 1e-4
-"""Over the mean radiance: tolerance of the exact values."""
+"""Tolerance of the exact values, over the mean radiance."""
 
 MOST_SAMPLES, FIRST_SAMPLES = 1 << 16, 256
 
 TRIED = 192
-"""Points at which the samples that a tolerance takes are found."""
+"""Number of points at which the samples that a tolerance needs are found."""
 
 
 @dataclass(frozen=True)
 class Points:
-    """Surface points: unit normals n and directions v to the viewer, (3, m) of the world, n·v > 0."""
+    """Surface points: unit normals n and directions v to the viewer, (3, m) in world axes, with n·v > 0."""
 
     n: np.ndarray
     v: np.ndarray
 
     @property
     def NoV(self) -> np.ndarray:
+        """n·v, (m,), at least 1e-6."""
         return np.clip((self.n * self.v).sum(0), 1e-6, 1.0)
 
     def surface(self) -> np.ndarray:
-        """(8, m): n, the direction of v's projection, n·v and √(1 - (n·v)²). Where v is n any direction will do."""
+        """n, the direction of v's projection, n·v and √(1 - (n·v)²), (8, m). Where v is n, the direction is any
+        tangent."""
         n, v, NoV = self.n, self.v, self.NoV
         across = v - NoV * n
         length = np.sqrt((across * across).sum(0))
@@ -88,13 +91,18 @@ class Points:
         return np.concatenate([n, across, NoV[None], np.sqrt((1 - NoV) * (1 + NoV))[None]])
 
     def some(self, index: Any) -> Points:
+        """The points of an index."""
         return Points(self.n[:, index], self.v[:, index])
 
 
 @dataclass(frozen=True)
 class Term:
-    """A summand of the BRDF as a set of S variants that share their samples: `models` by slot, and `parameters`, (S,)
-    each, under SLOT_NAME; `smooth` is the mirror's, roughness 0."""
+    """A summand of the BRDF, in S variants that share their samples.
+
+    models      models by slot
+    parameters  (S,) each, by SLOT_NAME
+    smooth      True for a mirror, roughness 0
+    """
 
     models: Mapping[str, Chosen]
     parameters: Mapping[str, np.ndarray]
@@ -102,10 +110,11 @@ class Term:
 
     @property
     def sets(self) -> int:
+        """The number S of variants."""
         return max((len(v) for v in self.parameters.values()), default=1)
 
     def width(self, device: Device) -> float:
-        """Of the lobe of its normals, 1 for a diffuse model."""
+        """Width of the lobe of the term's normals, 1 for a diffuse model."""
         if "ndf" not in self.models:
             return 1.0
         entry = self.models["ndf"].model
@@ -116,8 +125,10 @@ class Term:
 
 def term(*, roughness: float | None = None, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
          diffuse: Spec | None = None, **parameters: Any) -> Term:
-    """Of specs, an NDF's roughness and further parameters; a preset's RGB are three variants. Raises UsageError, and
-    UnsupportedError for an anisotropic NDF."""
+    """A term from specs, an NDF's perceptual roughness and further parameters; a preset's RGB become three variants.
+
+    Raises UsageError, and UnsupportedError for an anisotropic NDF.
+    """
     slots = slots_of(integral("albedo"), ndf, masking, fresnel, diffuse, None)
     given: dict[str, Any] = {}
     if ndf is not None and not slots["ndf"].model.isotropic:
@@ -137,7 +148,7 @@ def term(*, roughness: float | None = None, ndf: Spec | None = None, masking: Sp
 
 
 def albedo(found: Term, NoV: np.ndarray, device: Device) -> np.ndarray:
-    """(m, S): ∫ f (n·l) dω by quadrature."""
+    """Directional albedo ∫ f (n·l) dω of a term by quadrature, (m, S)."""
     distinct, which = np.unique(NoV, return_inverse=True)
     given: dict[str, Any] = {name: np.broadcast_to(v, (found.sets,)) for name, v in found.parameters.items()}
     models: dict[str, Any] = dict(found.models)
@@ -146,8 +157,11 @@ def albedo(found: Term, NoV: np.ndarray, device: Device) -> np.ndarray:
 
 
 def blocks(env: Environment, excess: np.ndarray, angle: float) -> np.ndarray:
-    """(k, 6) lights, unit directions and Ω L, of the excess over texels (h, w, 3) or (6, n, n, 3): one a texel, or of a
-    square of about `angle` radians where texels are smaller, in the direction of its middle by the mean of channels."""
+    """The excess of bright texels as lights (k, 6): unit directions and Ω L.
+
+    excess: (h, w, 3) or (6, n, n, 3). A light is one texel or, where texels are smaller than `angle` radians, a square
+    of about that size, in the direction of its middle, weighted by the mean of the channels.
+    """
     flat = excess.reshape(-1, 3)
     index = np.flatnonzero(flat.any(1))
     texel = texel_of(env)
@@ -165,7 +179,7 @@ def blocks(env: Environment, excess: np.ndarray, angle: float) -> np.ndarray:
 
 
 def cut(env: Environment, excess: np.ndarray, cuts: int) -> np.ndarray:
-    """(k, 6) lights as of `blocks`, each texel as cuts² of its parts."""
+    """The excess of bright texels as lights (k, 6), as `blocks`, with each texel cut into cuts² parts."""
     flat = excess.reshape(-1, 3)
     index = np.flatnonzero(flat.any(1))
     rows, columns = env.texels.shape[-3:-1]
@@ -189,15 +203,15 @@ def cut(env: Environment, excess: np.ndarray, cuts: int) -> np.ndarray:
 
 
 def texel_of(env: Environment) -> float:
-    """Radians of a texel, of the middle of a cube's face."""
+    """Angle of a texel in radians; for a cube, of one in the middle of a face."""
     return math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
 
 
 class Truth:
     """Reflected radiance in one environment, in the units of its texels.
 
-    Sums are of what lies above the least radiance of each channel and are divided by the sum of their own weights: the
-    albedo, by quadrature, stands for it, so that constant light comes out exactly.
+    Sums are over the radiance above the smallest value of each channel, and are divided by the sum of their own
+    weights. The albedo, by quadrature, replaces that sum, so that constant light comes out exactly.
     """
 
     def __init__(self, device: Device, env: Environment, precision: int = 32) -> None:
@@ -221,12 +235,12 @@ class Truth:
 
     @property
     def whole(self) -> Sampler:
-        """Of all light, for lobes too narrow for lights."""
+        """The sampler of all light, for lobes too narrow for lights."""
         self._whole = self._whole or self._sampler(self.env)
         return self._whole
 
     def lights(self, found: Term) -> np.ndarray | None:
-        """What is summed apart for a term, (k, 6); None where its lobe is narrower than that can be cut for."""
+        """The lights (k, 6) that are summed apart for a term; None where its lobe is too narrow to cut texels for."""
         width, count = found.width(self.device), int(self.excess.any(-1).sum())
         cuts = math.ceil(texel_of(self.env) / (NEAR * width))
         if count * cuts**2 > MOST_CUT and cuts > 1:
@@ -239,7 +253,10 @@ class Truth:
 
     def reflected(self, found: Term, points: Points, count: int, progress: Callable[[float], None] | None = None,
                   ) -> tuple[np.ndarray, np.ndarray]:
-        """((m, S, 3) radiance, (m, S) albedo) of points under a term, by `count` samples each."""
+        """(radiance (m, S, 3), albedo (m, S)) of points under a term.
+
+        count: samples of each point. progress: called with the share of points that is done.
+        """
         if found.smooth:
             return self.mirror(found, points)
         E, lights = albedo(found, points.NoV, self.device), self.lights(found)
@@ -250,7 +267,8 @@ class Truth:
         return value if lights is None else value + self.gathered(found, points, lights), E
 
     def mirror(self, found: Term, points: Points) -> tuple[np.ndarray, np.ndarray]:
-        """The same of a perfectly smooth surface: L(reflect(v)) F(n·v). [Hoffman2012, "Image Based Lighting"]"""
+        """As `reflected`, for a perfectly smooth surface: L(reflect(v)) F(n·v) [Hoffman2012, "Image Based Lighting"].
+        """
         entry, m = found.models["fresnel"].model, points.n.shape[1]
         rows = [np.broadcast_to(found.parameters[f"fresnel_{p.name}"], (found.sets,)) for p in entry.parameters]
         cells = np.stack([np.tile(points.NoV, found.sets), *(np.repeat(row, m) for row in rows)])
@@ -259,8 +277,12 @@ class Truth:
         return F[..., None].astype(np.float64) * L[:, None], F.astype(np.float64)
 
     def samples(self, found: Term, points: Points, tolerance: float) -> tuple[int, float]:
-        """Samples at which the 99th percentile of the errors of all variants is within `tolerance` at some of the
-        points, and that percentile, held against four times as many; MOST_SAMPLES where it is never."""
+        """(samples, error) at which the 99th percentile of the errors of all variants is within a tolerance, at some of
+        the points.
+
+        The errors are measured against four times as many samples. Where the tolerance is never met, the number is
+        MOST_SAMPLES.
+        """
         m = points.n.shape[1]
         some = points.some(np.unique(np.linspace(0, m - 1, min(TRIED, m)).astype(int)))
         mean = float(np.mean(self.env.statistics["mean"]))
@@ -274,7 +296,8 @@ class Truth:
             count, before = 4 * count, after
 
     def exact(self, found: Term, variant: int, points: Points, k: int) -> np.ndarray:
-        """(3,): what one variant reflects at point k, by quadrature in float64 over the environment's own texels."""
+        """Reflected radiance (3,) of one variant at point k, by quadrature in float64 over the environment's own
+        texels."""
         frame = frame_of(points.n[:, k].tolist())
         x, y, z = frame @ points.v[:, k]
         given: dict[str, Any] = {name: float(np.broadcast_to(v, (found.sets,))[variant])
@@ -287,7 +310,7 @@ class Truth:
 
     def sums(self, found: Term, points: Points, count: int, sampler: Sampler,
              progress: Callable[[float], None] | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """((m, S, 3), (m, S)): the means over `count` samples of weight × (L - base) and of the weights."""
+        """Means over `count` samples of weight × (L - base), (m, S, 3), and of the weights, (m, S)."""
         device, size, width = self.device, sampler.size, found.width(self.device)
         while size < LARGEST_SOURCE and math.pi / 2 / size > SHARPER * width:
             size *= 2
@@ -300,7 +323,7 @@ class Truth:
 
     def gathered(self, found: Term, points: Points, lights: np.ndarray,
                  progress: Callable[[float], None] | None = None) -> np.ndarray:
-        """(m, S, 3): ∑ Ω L f (n·l) over lights (k, 6), unit directions and Ω L."""
+        """∑ Ω L f (n·l) over lights (k, 6), unit directions and Ω L: (m, S, 3)."""
         if not len(lights):
             return np.zeros((points.n.shape[1], found.sets, 3))
         table = np.zeros((len(lights), 8))

@@ -1,4 +1,4 @@
-"""What the spheres of a picture are made of: roughness across and metalness down, or the materials of a scene."""
+"""Lays out the spheres of a picture: roughness across and metalness down, or the materials of a scene."""
 from __future__ import annotations
 
 import os
@@ -11,24 +11,24 @@ from whitefurnace.errors import InputError, UsageError
 from whitefurnace.scenes.materials import Material, Scene, Spread, read_scene
 
 DIELECTRIC = 0.04
-"""F0 of what is no metal, of an index of 1.5, in every engine here."""
+"""F0 of the insulating part for an index of refraction of 1.5, in every engine here."""
 
 COUNT_RANGE = (1, 64)
-"""Of columns, and of rows."""
+"""Range of the number of columns, and of rows."""
 
 MOST = 64
-"""Materials of a scene in one picture."""
+"""Largest number of a scene's materials in one picture."""
 
 EVEN = 1 / 128
-"""Two steps of 8 bits: a texture that varies by no more has one value."""
+"""Two steps of 8 bits. A texture that varies by no more counts as one value."""
 
 Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class MaterialSphere:
-    """What one sphere is made of: base colour, metalness and perceptual roughness in [0, 1], and F0 of what is no
-    metal, a number or RGB."""
+    """The material of one sphere: base colour, metalness and perceptual roughness in [0, 1], and F0 of the insulating
+    part, a number or RGB."""
 
     base_color: Triple
     metalness: float
@@ -39,8 +39,12 @@ class MaterialSphere:
 
 @dataclass(frozen=True)
 class SphereLayout:
-    """Spheres row by row, `columns` to a row, the last row maybe shorter. `roughness` of the columns and `metalness` of
-    the rows of a grid, empty for a scene's; and what the spheres leave out."""
+    """Spheres row by row, `columns` to a row; the last row may have fewer.
+
+    roughness  of the columns of a grid; `metalness` of its rows; both empty for a scene
+    notices    what the spheres leave out
+    scene      path of the scene, "" for a grid
+    """
 
     spheres: tuple[MaterialSphere, ...]
     columns: int
@@ -54,25 +58,28 @@ class SphereLayout:
         return -(-len(self.spheres) // self.columns)
 
     def placed(self) -> tuple[dict[str, object], ...]:
-        """Of a scene: each material's name, its row and column from 1, and what its sphere is made of."""
+        """For a scene: each material's name, its row and column from 1, and the values of its sphere."""
         return tuple({"name": s.name, "row": k // self.columns + 1, "column": k % self.columns + 1,
                       "base_color": s.base_color, "metalness": s.metalness, "roughness": s.roughness,
                       "f0": s.insulator} for k, s in enumerate(self.spheres)) if self.scene else ()
 
 
 def steps(count: int, alone: float) -> tuple[float, ...]:
+    """`count` values from 0 to 1 in equal steps; (alone,) for one value."""
     return tuple(float(x) for x in np.linspace(0, 1, count)) if count > 1 else (alone,)
 
 
 def in_range(what: str, value: int, limits: tuple[int, int] = COUNT_RANGE) -> None:
-    """Raises UsageError."""
+    """Check that a number is within its limits. Raises UsageError."""
     if not limits[0] <= value <= limits[1]:
         raise UsageError(f"{what} {value} is outside [{limits[0]}, {limits[1]}]")
 
 
 def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0, 1.0, 1.0)) -> SphereLayout:
-    """Roughness 0 … 1 from left to right, 0 where there is one column, and metalness 0 … 1 from the top down, 1 where
-    there is one row. Raises UsageError for what is out of its range."""
+    """A grid of spheres: roughness from 0 to 1 from left to right, metalness from 0 to 1 from the top down.
+
+    With one column the roughness is 0; with one row the metalness is 1. Raises UsageError for values out of range.
+    """
     in_range("columns", columns)
     in_range("rows", rows)
     color = np.asarray(base_color, np.float64)
@@ -84,9 +91,9 @@ def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0,
 
 
 def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
-    """A sphere for each material of a scene that light falls on, in the order of the file, at most MOST of them.
+    """A sphere for each lit material of a scene, in the order of the file, at most MOST of them.
 
-    Raises UsageError for columns out of range, InputError for a scene without such materials.
+    Raises UsageError for columns out of range, InputError for a scene in which every material is unlit.
     """
     in_range("columns", columns)
     lit = [m for m in scene.materials if not m.unlit]
@@ -109,8 +116,11 @@ def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
 
 def layout_of(scene: str | os.PathLike[str] | None, columns: int, rows: int | None,
          base_color: Sequence[float] | None) -> SphereLayout:
-    """A scene's materials, or the grid where no scene is given. Raises as they and `read_scene` do, UsageError for what
-    is of the grid alone."""
+    """The spheres of a scene's materials, or of a grid where no scene is given.
+
+    Raises UsageError for rows or a base colour together with a scene, and the errors of `of_grid`, `of_scene` and
+    `read_scene`.
+    """
     if scene is None:
         return of_grid(columns, 3 if rows is None else rows, (1.0, 1.0, 1.0) if base_color is None else base_color)
     if rows is not None:
@@ -122,13 +132,15 @@ def layout_of(scene: str | os.PathLike[str] | None, columns: int, rows: int | No
 
 
 def middle(spread: Spread) -> np.ndarray:
-    """(channels,): the mean over what is in use, of the ends where that is not known."""
+    """Mean of a property over the texels in use, (channels,); the middle of its range where the mean is not known."""
     return np.array(spread.mean) if spread.mean else (np.array(spread.low) + np.array(spread.high)) / 2
 
 
 def insulator(m: Material) -> Triple:
-    """F0 by KHR_materials_ior and KHR_materials_specular: min(((n - 1)/(n + 1))² c, 1) w; an ior of 0 stands for
-    infinity. What neither says is the engines' .04."""
+    """F0 of the insulating part by KHR_materials_ior and KHR_materials_specular: min(((n - 1)/(n + 1))² c, 1) w.
+
+    An ior of 0 stands for infinity. Without either extension it is the engines' .04.
+    """
     ior, weight, tint = middle(m["ior"])[0], middle(m["specular"])[0], middle(m["specular_color"])
     f0 = DIELECTRIC if ior == 1.5 else 1.0 if ior == 0 else ((ior - 1) / (ior + 1)) ** 2
     return _triple(np.minimum(f0 * tint, 1) * weight)

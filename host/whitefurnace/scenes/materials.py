@@ -1,5 +1,5 @@
-"""What is in a glTF scene: its materials, with the range that each of their values takes through factors and textures,
-its size and its cameras. Nothing is decided here; `needs` does."""
+"""Reads a glTF scene: its materials, with the range of each value through factors and textures, its size and its
+cameras. `needs` decides what follows from them."""
 from __future__ import annotations
 
 import math
@@ -23,19 +23,24 @@ MAX_INDICES = 1 << 26
 """Of triangles whose texture coordinates are looked at, all in all; then whole images count."""
 
 BINS = 64
-"""Of histograms, equal parts of [0, 1]."""
+"""Number of bins of a histogram, equal parts of [0, 1]."""
 
 TILES = 512
-"""An edge at most of the grid of tiles in which triangles mark what they use of an image."""
+"""Largest edge of the grid of tiles in which triangles mark the parts of an image that they use."""
 
 ROUNDING = 1e-4
-"""What a factor may be beyond its range, as exporters round: it is taken as the end."""
+"""How far a factor may lie outside its range, as exporters round. It is clamped to the range."""
 
 
 @dataclass(frozen=True)
 class Property:
-    """A value that a material has: the extension it is of ("": glTF's own), its factor and texture there, the channels
-    of the texture that multiply it, their transfer function, and the range a factor may have."""
+    """A value that a material has.
+
+    extension  that defines it, "" for glTF's core
+    factor     name of its factor; `default`: the factor's default
+    texture    name of its texture; `channels`: those that multiply the factor; `srgb`: their transfer function
+    low, high  range of the factor
+    """
 
     name: str
     extension: str
@@ -91,9 +96,14 @@ Given = Literal["default", "factor", "texture"]
 
 @dataclass(frozen=True)
 class Spread:
-    """The values of one property over a surface, a channel each: `low` to `high`, `mean` over the texels in use, empty
-    where it is not known. `histogram` are shares of BINS parts of [0, 1], of one channel; empty for a single value.
-    `given` is where it is from; `seen` whether the texels were: else the whole range of the factor is assumed."""
+    """The values of one property over a surface.
+
+    low, high  range of each channel
+    mean       over the texels in use, empty where it is not known
+    given      where the value comes from
+    histogram  shares of BINS equal parts of [0, 1], for one channel; empty for a single value
+    seen       True if the texels were read; if not, the whole range of the factor is assumed
+    """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
@@ -104,16 +114,17 @@ class Spread:
 
     @property
     def least(self) -> float:
-        """Of all channels."""
+        """The smallest value of all channels."""
         return min(self.low)
 
     @property
     def most(self) -> float:
+        """The largest value of all channels."""
         return max(self.high)
 
     @property
     def shares(self) -> tuple[tuple[float, float, float], ...]:
-        """(low, high, share) of each part of the range that is in use, ends cut to it; for one channel."""
+        """(low, high, share) of each part of the range in use, cut to its ends; for a property of one channel."""
         if not self.histogram:
             return ((self.least, self.most, 1.0),)
         return tuple((max(k / BINS, self.least), min((k + 1) / BINS, self.most), share)
@@ -122,8 +133,12 @@ class Spread:
 
 @dataclass(frozen=True)
 class Material:
-    """A material that something in the scene has. `values` are by the names of PROPERTIES; `given` the extensions that
-    it has; `uses` how many primitives have it; `unread` extensions that are not known here."""
+    """A material that the scene uses.
+
+    values  spreads by the names of PROPERTIES
+    given   extensions that it has; `unread`: those that are not known here
+    uses    number of primitives that have it
+    """
 
     name: str
     values: Mapping[str, Spread]
@@ -136,14 +151,18 @@ class Material:
         return self.values[name]
 
     def has(self, extension: str) -> bool:
-        """Whether it has KHR_materials_`extension`."""
+        """True if it has KHR_materials_`extension`."""
         return _KHR + extension in self.given
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A camera that stands in the scene: where, looking which way, and its vertical angle in radians, or for an
-    orthographic one the height it sees, in metres."""
+    """A camera of the scene.
+
+    position, direction  in world axes, metres
+    yfov                 vertical angle in radians of a perspective camera, else None
+    height               metres that an orthographic camera shows, else None
+    """
 
     name: str
     position: tuple[float, float, float]
@@ -154,8 +173,11 @@ class Camera:
 
 @dataclass(frozen=True)
 class Scene:
-    """What `read_scene` found. `low` and `high` are the corners of the box around it in metres, None without any
-    positions; `lights` how many punctual lights there are."""
+    """The content of a glTF scene.
+
+    low, high  corners of the box around it in metres, None for a scene without positions
+    lights     number of punctual lights
+    """
 
     path: Path
     materials: tuple[Material, ...]
@@ -167,7 +189,7 @@ class Scene:
 
     @property
     def extent(self) -> tuple[float, float, float] | None:
-        """Its size along x, y and z in metres."""
+        """Size along x, y and z in metres."""
         if self.low is None or self.high is None:
             return None
         x, y, z = (b - a for a, b in zip(self.low, self.high, strict=True))
@@ -175,18 +197,18 @@ class Scene:
 
 
 def read_scene(path: str | os.PathLike[str]) -> Scene:
-    """The scene of a .glb or .gltf, its buffers and images in it or in its folder.
+    """Read the scene of a .glb or .gltf file, with its buffers and images from it or from its folder.
 
-    Raises FileError for what cannot be read, InputError for what is no valid glTF 2 (missing buffers, cyclic nodes,
-    wrong accessors, values out of range, files outside its folder), UnsupportedError without pygltflib, and for what
-    the file requires and is not known.
+    Raises FileError for a file that cannot be read; InputError for one that is not valid glTF 2 (missing buffers,
+    cyclic nodes, wrong accessors, values out of range, files outside its folder); UnsupportedError without pygltflib,
+    and for required extensions that are not known.
     """
     library()
     return _Reading(Gltf(path)).scene()
 
 
 def library() -> Any:
-    """pygltflib. Raises UnsupportedError without it."""
+    """The module pygltflib. Raises UnsupportedError where it is not installed."""
     try:
         import pygltflib
     except ImportError:
@@ -203,15 +225,18 @@ _ALLOWED = KNOWN | {"KHR_texture_transform", "KHR_lights_punctual", "KHR_mesh_qu
 
 @dataclass
 class _Use:
-    """What of an image a material uses: rectangles of its texture coordinates (n, 4) as low u, low v, high u, high v in
-    [0, 1], None for all of it; and where its counts of codes go."""
+    """The part of an image that a material uses.
+
+    boxes   rectangles (n, 4) of texture coordinates as low u, low v, high u, high v in [0, 1]; None for all of it
+    counts  receives the counts of the image's codes there
+    """
 
     boxes: np.ndarray | None
     counts: np.ndarray | None = None
 
 
 class _Reading:
-    """One file on its way to a Scene."""
+    """Reads one file into a `Scene`."""
 
     def __init__(self, gltf: Gltf) -> None:
         self.gltf, self.take = gltf, gltf.take
@@ -585,7 +610,7 @@ def _around(triangles: np.ndarray, wraps: tuple[int, int]) -> np.ndarray:
 
 
 def _tiles(boxes: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """(rows, columns) bool: tiles of the image that boxes touch, or that are beside one, which a filter reads too."""
+    """Tiles (rows, columns) of the image, bool, that boxes touch, and their neighbours, which a filter reads too."""
     x0, y0 = (np.clip(np.floor(boxes[:, k] * n).astype(int) - 1, 0, n) for k, n in ((0, columns), (1, rows)))
     x1, y1 = (np.clip(np.floor(boxes[:, k] * n).astype(int) + 2, 0, n) for k, n in ((2, columns), (3, rows)))
     # Corners of each box; their running sums along both axes count the boxes over a tile.

@@ -1,5 +1,5 @@
-"""What the media inside a scene's materials ask for at the scale that they are seen at: what size light crosses, what a
-pixel covers, and the table of pre-integrated diffusion where local diffuse is wrong."""
+"""Judges the media inside a scene's materials: the size that light crosses, the length that a pixel covers, and the
+table of pre-integrated diffusion that is needed where local diffuse is wrong."""
 from __future__ import annotations
 
 import math
@@ -18,7 +18,7 @@ TABLE = 64
 """Texels a side of a table of diffusion. Along n·l they are as far apart as those of an 8-bit diffuse ramp of 64."""
 
 ROWS = 16384
-"""The highest image that --resolution takes."""
+"""Largest height of an image that --resolution takes."""
 
 _NAMES = {"σa": "absorption", "sigma_a": "absorption", "absorption": "absorption", "σs": "scattering",
           "sigma_s": "scattering", "scattering": "scattering", "g": "g", "ior": "ior", "distance": "distance",
@@ -27,9 +27,14 @@ _NAMES = {"σa": "absorption", "sigma_a": "absorption", "absorption": "absorptio
 
 @dataclass(frozen=True)
 class Inside:
-    """What is inside of a material, "" for the scene as a whole: its judgement, None with the `reason` where it has no
-    inside; `size_of` tells which size light crosses; `table` are options of `lut` with a file's name as `output`, None
-    where none is needed, or none can be made, as `reason` says."""
+    """The medium inside a material.
+
+    material   its name, "" for the scene as a whole
+    judgement  None for a material without an inside, for the given `reason`
+    size_of    says which size light crosses
+    table      options of `lut` with a file's name as `output`; None where no table is needed, or where none can be made
+               for the given `reason`
+    """
 
     material: str
     judgement: Judgement | None
@@ -39,12 +44,13 @@ class Inside:
 
     @property
     def head(self) -> str:
+        """The material's name, with the size that light crosses."""
         size = None if self.judgement is None else self.judgement.size
         return (self.material or "the scene") + (f", {length_text(size)} across ({self.size_of})" if size else "")
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """What is to be said of it, the command of its table last."""
+        """Sentences about the medium; the last is the command of its table, if it needs one."""
         said = [*(self.judgement.sentences if self.judgement else ()), *([self.reason] if self.reason else [])]
         if self.table is not None:
             numbers = "".join(f" --set {one}" for one in self.table.get("set", ()))
@@ -55,13 +61,14 @@ class Inside:
 
 @dataclass(frozen=True)
 class Pixel:
-    """Metres a pixel covers, and the camera that it is of."""
+    """The length in metres that a pixel covers, and the name of the camera."""
 
     metres: float
     of: str = ""
 
     @property
     def text(self) -> str:
+        """A phrase that states the length."""
         return f"a pixel is {length_text(self.metres)}" + (f", as {self.of} sees the nearest of it" if self.of else "")
 
 
@@ -69,10 +76,12 @@ class Pixel:
 
 
 def named_media(texts: Sequence[str], scene: Scene) -> dict[str, Medium]:
-    """Media of `[MATERIAL:]MEDIUM` by material, "" for the scene as a whole. MEDIUM is a name of scale.MEDIA, or
-    numbers as `σa=.03/.17/.48,σs=.74/.88/1.01,g=0,ior=1.3` per mm, one or three of each, or
-    `distance=0.1m,color=.9/.5/.1` as KHR_materials_volume has them in place of σa. Without an ior the material's is
-    taken. Raises UsageError."""
+    """The media of texts `[MATERIAL:]MEDIUM`, by material; "" is the scene as a whole.
+
+    MEDIUM is a name of scale.MEDIA, or numbers per mm as `σa=.03/.17/.48,σs=.74/.88/1.01,g=0,ior=1.3`, one or three of
+    each. `distance=0.1m,color=.9/.5/.1`, as in KHR_materials_volume, replaces σa. Without an ior the material's is
+    used. Raises UsageError.
+    """
     found: dict[str, Medium] = {}
     names = [m.name for m in scene.materials]
     for text in texts:
@@ -135,8 +144,10 @@ def _per_metre(values: Triple) -> Triple:
 
 
 def pixel_of(scene: Scene, text: str | None = None, rows: int | None = None) -> Pixel | None:
-    """What a pixel covers: as `text` says (0.5mm), or in an image of `rows` rows of the camera that sees the scene
-    largest; None without either. Raises UsageError."""
+    """The length that a pixel covers, None where neither `text` nor `rows` is given.
+
+    text: a length as `0.5mm`. rows: height of an image of the camera that shows the scene largest. Raises UsageError.
+    """
     if text is not None and rows is not None:
         raise UsageError("give --pixel or --resolution, not both")
     if text is not None:
@@ -160,7 +171,7 @@ def pixel_of(scene: Scene, text: str | None = None, rows: int | None = None) -> 
 
 
 def _distance(scene: Scene, position: np.ndarray) -> float:
-    """To the box around the scene, from inside of it to its middle; 0 where there is none."""
+    """Distance to the box around the scene, from inside it to its middle; 0 where there is no box."""
     if scene.low is None or scene.high is None:
         return 0.0
     low, high = np.array(scene.low), np.array(scene.high)
@@ -172,8 +183,8 @@ def _distance(scene: Scene, position: np.ndarray) -> float:
 
 
 def inside(scene: Scene, pixel: Pixel | None, media: dict[str, Medium]) -> tuple[Inside, ...]:
-    """What each medium asks for: those of `media`, and of KHR_materials_volume in materials that have none there.
-    Raises UsageError."""
+    """What each medium needs, of `media` and of the KHR_materials_volume in materials without one there. Raises
+    UsageError."""
     found = []
     for m in scene.materials:
         if m.name in media or m.has("volume"):
@@ -215,7 +226,8 @@ def _judged(scene: Scene, pixel: Pixel | None, m: Material | None, medium: Mediu
 
 
 def _size(scene: Scene, m: Material | None) -> tuple[float | None, str]:
-    """What light crosses at most: a material's thickness, else the least side of the box around the scene."""
+    """The largest length that light crosses, and its name: a material's thickness, else the shortest side of the
+    scene's box."""
     if m is not None and m["thickness"].most > 0:
         return m["thickness"].most, "its thickness"
     sides = [side for side in scene.extent or () if side > 0]
@@ -223,12 +235,12 @@ def _size(scene: Scene, m: Material | None) -> tuple[float | None, str]:
 
 
 def _ior(m: Material) -> float:
-    """glTF's 0 stands for a mirror: nothing of it is known to a medium."""
+    """The index of refraction within the range of a medium; glTF's 0, a mirror, becomes 1."""
     return min(max(m["ior"].most, 1.0), 3.0)
 
 
 def _file(material: str, taken: set[str]) -> str:
-    """A file's name from that of a material, which may be anything."""
+    """A file name made from that of a material, which may contain any characters."""
     stem = "diffusion" + "".join(f"_{part}" for part in re.findall(r"[A-Za-z0-9-]+", material)[:8])
     name, k = f"{stem}.npy", 2
     while name.lower() in taken:

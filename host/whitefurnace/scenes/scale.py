@@ -1,6 +1,6 @@
-"""What a scene's scale asks for: whether a medium absorbs enough to be seen over an object's size, and whether light
-leaves farther than a pixel from where it entered. Diffuse light is subsurface scattering seen from far enough.
-[Hoffman2012]
+"""Judges the media of a scene at its scale: whether absorption is visible over an object's size, and whether light
+leaves farther than a pixel from where it entered. Diffuse light is subsurface scattering seen from far enough
+[Hoffman2012].
 
 Lengths are in metres and coefficients per metre; three numbers are RGB.
 """
@@ -23,30 +23,30 @@ UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, 
          "yd": 0.9144, "mi": 1609.344}
 
 NOTICEABLE = 2.3
-"""The least ΔE*ab that is noticed between two colours. [Mahy1994] A grey has it where 6 % is lost."""
+"""Smallest ΔE*ab between two colours that people notice [Mahy1994]. A grey has it where 6 % of the light is lost."""
 
 BLACK = 1 / (255 * 12.92)
-"""The linear value of code 1 of 8-bit sRGB: what lets less through than that lets nothing through."""
+"""Linear value of code 1 of 8-bit sRGB. A medium that transmits less than this is opaque."""
 
 SHARE = 0.95
-"""Of the light that leaves, what must do so within a pixel for local diffuse to be right. At an edge of light at most
-half of the rest, 2.5 %, is then missing a pixel inside: less than the 6 % that are noticed."""
+"""Share of the leaving light that must leave within a pixel for local diffuse to be right. At an edge of light at most
+half of the rest, 2.5 %, is then missing a pixel inside, less than the 6 % that people notice."""
 
 FAINT = 0.01
-"""A diffuse reflectance below which a channel is black, however far its light goes."""
+"""Diffuse reflectance below which a channel is black, however far its light goes."""
 
 COLOURS = ("red", "green", "blue")
 
 _XYZ = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750],
                  [0.0193339, 0.1191920, 0.9503041]])
-"""Linear Rec.709 to CIE XYZ, D65."""
+"""Matrix from linear Rec.709 to CIE XYZ, D65."""
 
 
 # ------------------------------------------------------------------------------------------------- lengths and pixels
 
 
 def length(text: str) -> float:
-    """Metres of `0.5mm`. Raises UsageError."""
+    """Metres of a length with its unit, as `0.5mm`. Raises UsageError."""
     match = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?[0-9]+)?)\s*([^\s0-9]*)\s*", text)
     try:
         value = float(match[1]) if match else math.nan
@@ -61,9 +61,11 @@ def length(text: str) -> float:
 
 def footprint(height: int, *, yfov: float | None = None, distance: float | None = None,
               ymag: float | None = None) -> float:
-    """Metres that a pixel covers of an image `height` pixels high: of a perspective camera with the vertical angle
-    `yfov` in radians at a distance in metres, or of an orthographic one that shows 2 `ymag` metres, as glTF has them.
-    Raises UsageError."""
+    """Metres that a pixel of an image covers, for a camera as glTF has them.
+
+    height: of the image in pixels. yfov, distance: vertical angle in radians of a perspective camera, and metres to the
+    object. ymag: half the height in metres that an orthographic camera shows. Raises UsageError.
+    """
     if height < 1:
         raise UsageError(f"an image of {height} rows has no pixel")
     if (yfov is None) == (ymag is None):
@@ -100,8 +102,14 @@ def length_text(metres: float) -> str:
 
 @dataclass(frozen=True)
 class Medium:
-    """A homogeneous medium: absorption σa and scattering σs per metre (σa may be infinite), the mean cosine `g` of
-    scattering, the index of refraction of its boundary. Raises UsageError outside of their domains."""
+    """A homogeneous medium.
+
+    absorption, scattering  σa and σs per metre; σa may be infinite
+    g                       mean cosine of scattering, in (-1, 1)
+    ior                     index of refraction of its boundary, in [1, 3]
+
+    Raises UsageError for values out of range.
+    """
 
     absorption: Triple
     scattering: Triple = (0.0, 0.0, 0.0)
@@ -125,8 +133,10 @@ class Medium:
     @classmethod
     def of_volume(cls, attenuation_distance: float | None = None, attenuation_color: Sequence[float] = (1, 1, 1), *,
                   scattering: Triple = (0.0, 0.0, 0.0), g: float = 0.0, ior: float = 1.5, name: str = "") -> Medium:
-        """Of glTF's KHR_materials_volume: light is `attenuation_color` after `attenuation_distance` metres (None or
-        infinity: nothing is absorbed), σa = -ln(colour)/distance. The extension has no scattering. Raises UsageError.
+        """The medium of glTF's KHR_materials_volume, σa = -ln(colour)/distance.
+
+        attenuation_distance: metres after which white light has the colour `attenuation_color`; None or infinity for no
+        absorption. The extension has no scattering. Raises UsageError.
         """
         if attenuation_distance is None:
             attenuation_distance = math.inf
@@ -140,39 +150,40 @@ class Medium:
 
     @property
     def reduced(self) -> np.ndarray:
-        """σs' = σs (1 - g): as much scattering, were it even in all directions."""
+        """Reduced scattering σs' = σs (1 - g), which scatters as much if it is even in all directions."""
         return np.array(self.scattering) * (1 - self.g)
 
     @property
     def mean_free_path(self) -> Triple:
-        """1/(σa + σs'), infinite in a channel without either."""
+        """1/(σa + σs') in metres, infinite in a channel without either."""
         return _triple(_inverse(np.array(self.absorption) + self.reduced))
 
     @property
     def diffusion_length(self) -> Triple:
-        """1/√(3 σa (σa + σs')), over which diffuse light falls to 1/e. [Jensen2001]"""
+        """1/√(3 σa (σa + σs')) in metres, over which diffuse light falls to 1/e [Jensen2001]."""
         sigma = np.array(self.absorption)
         return _triple(_inverse(np.sqrt(3 * sigma * (sigma + self.reduced))))
 
     @property
     def albedo(self) -> Triple:
-        """The diffuse reflectance, of a body so large that no light crosses it. [Jensen2001]"""
+        """Diffuse reflectance of a body so large that no light crosses it [Jensen2001]."""
         return _triple(diffuse_reflectance(self.reduced, self.absorption, self.ior))
 
     @property
     def lost(self) -> Triple:
-        """1 - α', the share that each collision absorbs, were scattering even; 1 where nothing scatters."""
+        """1 - α', the share of light that each collision absorbs under even scattering; 1 where nothing scatters."""
         sigma, reduced = np.array(self.absorption), self.reduced
         whole = np.where(np.isfinite(sigma) & (reduced > 0), sigma + reduced, 1.0)
         return _triple(np.where(np.isfinite(sigma) & (reduced > 0), sigma, 1.0) / whole)
 
     @property
     def spread(self) -> Triple:
-        """The radius within which 95 % of what leaves does so, 0 in a channel that reflects nothing. [Jensen2001]"""
+        """Radius in metres within which 95 % of the leaving light leaves; 0 in a channel that reflects nothing
+        [Jensen2001]."""
         return _triple(self._path * within(SHARE, self.lost, self.ior))
 
     def beyond(self, radius: float) -> Triple:
-        """The share of what leaves that does so farther than `radius` metres from where it entered. [Jensen2001]"""
+        """Share of the leaving light that leaves farther than `radius` metres from where it entered [Jensen2001]."""
         path = self._path
         some = path > 0
         return _triple(np.where(some, beyond(radius / np.where(some, path, 1.0), self.lost, self.ior), 0.0))
@@ -183,7 +194,7 @@ class Medium:
         return np.where(np.array(self.lost) < 1, self.mean_free_path, 0.0)
 
     def parameters(self) -> dict[str, float]:
-        """What `lut diffusion --scheme dipole` is told of it, per mm."""
+        """The medium's parameters for `lut diffusion --scheme dipole`, per mm."""
         given = {f"{name}_{c}": value * 1e-3 for name in ("absorption", "scattering")
                  for c, value in zip("rgb", getattr(self, name), strict=True)}
         return {**given, "g": self.g, "ior": self.ior}
@@ -204,11 +215,11 @@ MEDIA: Mapping[str, Medium] = {
     **{name: Medium(_triple(1e3 * np.array(a)), _triple(1e3 * np.array(s)), ior=ior, name=name)
        for name, (s, a, ior) in JENSEN.items()},
 }
-"""Measured media: water [PopeFry1997], air [Bruneton2008], the rest [Jensen2001], whose scattering is reduced."""
+"""Measured media: water [PopeFry1997], air [Bruneton2008], and those of [Jensen2001], whose scattering is reduced."""
 
 
 def medium(name: str) -> Medium:
-    """A medium by its name. Raises UsageError with the nearest."""
+    """The measured medium of a name. Raises UsageError with the nearest name."""
     if name not in MEDIA:
         raise UsageError(f"unknown medium {name!r}{nearest(name, MEDIA)}")
     return MEDIA[name]
@@ -219,10 +230,14 @@ def medium(name: str) -> Medium:
 
 @dataclass(frozen=True)
 class Absorption:
-    """What a medium takes from light that crosses `size` metres: "negligible", "matters" or "opaque".
+    """The effect of absorption on light that crosses an object.
 
-    `transmittance` is e^(-σa size), `difference` the ΔE*ab of white seen through it (2.3 are noticed), `half` where
-    half is gone."""
+    verdict        "negligible", "matters" or "opaque"
+    transmittance  e^(-σa size)
+    difference     ΔE*ab of white seen through it; people notice 2.3
+    half           metres after which half of the light is gone
+    reason         a sentence for users
+    """
 
     verdict: str
     transmittance: Triple
@@ -235,9 +250,12 @@ class Absorption:
 class Transport:
     """Where light leaves that was scattered inside.
 
-    "clear": none is to speak of: refraction and absorption, and nothing diffuse. "cloudy": some is, but it turns less
-    than once on its way across: a volume. "local": diffuse light leaves within a pixel of where it entered.
-    "subsurface": it does not. "translucent": it does not, and some leaves on the other side.
+    verdict is one of
+    "clear"        almost no light is scattered: only refraction and absorption
+    "cloudy"       some light is scattered, less than once on its way across: a volume
+    "local"        diffuse light leaves within a pixel of where it entered
+    "subsurface"   diffuse light leaves farther than a pixel from where it entered
+    "translucent"  as subsurface, and some of it leaves on the other side
     """
 
     verdict: str
@@ -251,7 +269,7 @@ class Transport:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a medium asks for at a scale; None where that was not told."""
+    """What a medium needs at a scale. `absorption` is None without a size, `transport` without a pixel."""
 
     medium: Medium
     size: float | None
@@ -261,7 +279,7 @@ class Judgement:
 
     @property
     def subsurface(self) -> bool:
-        """Whether local diffuse is wrong, and subsurface scattering needed."""
+        """True if local diffuse is wrong and subsurface scattering is needed."""
         return self.transport is not None and self.transport.verdict in ("subsurface", "translucent")
 
     @property
@@ -269,7 +287,7 @@ class Judgement:
         return tuple(part.reason for part in (self.absorption, self.transport) if part)
 
     def data(self) -> dict[str, Any]:
-        """As data for JSON, what is infinite as None."""
+        """The judgement as JSON data, with None for infinite values."""
         return {**_plain(asdict(self)), "subsurface": self.subsurface}  # type: ignore[dict-item]
 
 
@@ -282,8 +300,11 @@ def _plain(value: Any) -> Any:
 
 
 def judge(medium: Medium, size: float | None = None, pixel: float | None = None) -> Judgement:
-    """What `medium` asks for in an object of `size` metres seen with pixels of `pixel` metres. Absorption needs the
-    size; how light leaves needs the pixel, and knows whether it crosses the object with the size. Raises UsageError."""
+    """Judge a medium in an object of `size` metres that is seen with pixels of `pixel` metres.
+
+    The size decides about absorption. The pixel decides where light leaves; with the size, also whether light crosses
+    the object. Raises UsageError for a length that is not above 0.
+    """
     for name, value in (("size", size), ("pixel", pixel)):
         if value is not None:
             _positive(name, value)
@@ -292,7 +313,7 @@ def judge(medium: Medium, size: float | None = None, pixel: float | None = None)
 
 
 def difference(colour: Sequence[float] | np.ndarray) -> float:
-    """ΔE*ab between white and a colour in linear Rec.709. [CIE15]"""
+    """ΔE*ab between white and a colour in linear Rec.709 [CIE15]."""
     ratio = _XYZ @ np.asarray(colour, np.float64) / _XYZ.sum(1)
     f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio * (29 / 6) ** 2 / 3 + 4 / 29)
     return float(np.linalg.norm([116 * (f[1] - 1), 500 * (f[0] - f[1]), 200 * (f[1] - f[2])]))
