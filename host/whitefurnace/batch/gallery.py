@@ -22,7 +22,7 @@ from whitefurnace.files import read_manifest, write_atomic
 from whitefurnace.rendering.thumbnails import CELL, LOOK, read_thumbnail, write_thumbnail
 from whitefurnace.text import size as bytes_text
 
-INDEX, STRIPS = "index.html", "strips"
+INDEX, THUMBNAILS = "index.html", "strips"
 OURS = b'<meta name="generator" content="whitefurnace">'
 MANY = 500
 """Rows of which a browser lays out only those in sight."""
@@ -67,14 +67,14 @@ def found_in(output: str | os.PathLike[str]) -> Iterator[Result]:
     """What the manifests in a folder of outputs, and in those below it, tell of, in the order of their paths."""
     output = Path(output)
     for path in sorted(output.rglob("*.json")):
-        told = None if path.name.startswith(".") else read_manifest(path)
-        if told is None or not isinstance(told.get("key"), str):
+        stated = None if path.name.startswith(".") else read_manifest(path)
+        if stated is None or not isinstance(stated.get("key"), str):
             continue
         name, place = path.name.removesuffix(".json"), path.relative_to(output).as_posix()
-        if told.get("name") == name:
-            kind = "bake" if isinstance(told.get("levels"), list) else "lut"
+        if stated.get("name") == name:
+            kind = "bake" if isinstance(stated.get("levels"), list) else "lut"
             yield Result(0, kind, place, name, "skipped", str(path.parent if kind == "bake" else path.with_name(name)),
-                         str(path), nbytes=_size_of(told))
+                         str(path), nbytes=_size_of(stated))
 
 
 class Gallery:
@@ -84,7 +84,7 @@ class Gallery:
         self.folder = Path(folder)
         self.title = title
         self._rows: dict[str, list[tuple[int, int, int, int]]] = {"failed": [], "bake": [], "lut": []}
-        self._strips: set[str] = set()
+        self._thumbnails: set[str] = set()
         self._states = dict.fromkeys(("done", "skipped", "failed"), 0)
         self._nbytes, self._seconds, self._made = 0, 0.0, 0.0
         self._error: tuple[float, str] | None = None
@@ -144,8 +144,8 @@ class Gallery:
 
     def _sweep(self) -> None:
         with contextlib.suppress(OSError):  # there is no picture
-            for entry in os.scandir(self.folder / STRIPS):
-                if re.fullmatch(r"\.?[0-9a-f]{32}-\d+\.png(\.tmp)?", entry.name) and entry.name not in self._strips:
+            for entry in os.scandir(self.folder / THUMBNAILS):
+                if re.fullmatch(r"\.?[0-9a-f]{32}-\d+\.png(\.tmp)?", entry.name) and entry.name not in self._thumbnails:
                     os.unlink(entry.path)
 
     # --------------------------------------------------------------------------------------------- rows
@@ -155,10 +155,10 @@ class Gallery:
                 f'<td data-v="{result.exit_code}">{result.exit_code}</td></tr>\n')
 
     def _row(self, result: Result) -> str:
-        told = read_manifest(result.manifest) or {}
+        stated = read_manifest(result.manifest) or {}
         self._nbytes += result.nbytes
-        self._count(told)
-        notices = list(dict.fromkeys([*result.notices, *_notices(told)]))
+        self._count(stated)
+        notices = list(dict.fromkeys([*result.notices, *_notices(stated)]))
         seconds = sum(result.seconds.values()) if result.state == "done" else None
         if seconds is not None:
             self._seconds += seconds
@@ -167,54 +167,54 @@ class Gallery:
         link = _link(result.manifest, self.folder)
         name = f'<a href="{link}"><bdi>{_text(result.name)}</bdi></a>' if link else f"<bdi>{_text(result.name)}</bdi>"
         if result.kind == "lut":
-            error = _number(told.get("error"))
+            error = _finite_number(stated.get("error"))
             self._larger(error, result.name)
-            about = f'<span class="small">{_text(_table_about(told))}</span>'
+            about = f'<span class="small">{_text(_table_about(stated))}</span>'
             cells = "".join((_cell(error, _figure(error)), *ends, _listed(notices)))
             return f'<tr><th scope="row"><span class="name">{name}</span>{about}</th>{cells}</tr>\n'
-        rows = _levels(told)
-        error = max((e for row in rows if (e := _number(row.get("error"))) is not None), default=None)
-        worst = max((e for row in rows if (e := _number(row.get("worst"))) is not None), default=None)
+        rows = _levels(stated)
+        error = max((e for row in rows if (e := _finite_number(row.get("error"))) is not None), default=None)
+        worst = max((e for row in rows if (e := _finite_number(row.get("worst"))) is not None), default=None)
         self._larger(error, result.name)
-        stored = _stored(told)
+        stored = _stored(stated)
         first = (f'<span class="name">{name}</span><span class="small cut"><bdi>{_text(result.place)}</bdi></span>'
-                 f'<span class="small">{_text(_about(told))}</span>{self._strip(result, told)}')
+                 f'<span class="small">{_text(_about(stated))}</span>{self._thumbnail(result, stated)}')
         items = "".join(f"<li><b>{_text(engine)}</b> {_figure(e)}</li>" for engine, e in stored.items())
         beside = "" if worst is None else f'<span class="small">worst {_figure(worst)}</span>'
         cells = "".join((
             _cell(error, _figure(error) + beside),
             _cell(max(stored.values(), default=None), f"<ul>{items}</ul>" if items else "–"), *ends,
-            _share(_number(_dict(_dict(told.get("source")).get("statistics")).get("brightest_share"))),
+            _share(_finite_number(_dict(_dict(stated.get("source")).get("statistics")).get("brightest_share"))),
             _energy(rows), _listed(notices)))
         return f'<tr><th scope="row">{first}</th>{cells}</tr>\n'
 
-    def _strip(self, result: Result, told: Mapping[str, Any]) -> str:
+    def _thumbnail(self, result: Result, stated: Mapping[str, Any]) -> str:
         """The picture of a bake, made where there is none of its key."""
-        key = told.get("key")
+        key = stated.get("key")
         if not isinstance(key, str) or not re.fullmatch("[0-9a-f]{64}", key):
             return '<span class="small none">no picture: its manifest has no key</span>'
         name = f"{key[:32]}-{LOOK}.png"
-        path = self.folder / STRIPS / name
+        path = self.folder / THUMBNAILS / name
         if not path.is_file():
             try:
-                read = read_thumbnail(Path(result.manifest), told)
+                read = read_thumbnail(Path(result.manifest), stated)
             except WhitefurnaceError as error:
                 return f'<span class="small none">no picture: <bdi>{_text(str(error))}</bdi></span>'
             path.parent.mkdir(parents=True, exist_ok=True)
             write_thumbnail(path, read)
-        self._strips.add(name)
+        self._thumbnails.add(name)
         width, height = _dimensions(path)
         spheres = width // CELL - 3
         several = f"metal spheres of its {spheres} levels" if spheres > 1 else "a metal sphere of it"
-        return (f'<img class="strip" src="{STRIPS}/{name}" width="{width}" height="{height}" loading="lazy" '
+        return (f'<img class="strip" src="{THUMBNAILS}/{name}" width="{width}" height="{height}" loading="lazy" '
                 f'decoding="async" alt="Level 0 as a panorama, {several}, a matte sphere">')
 
-    def _count(self, told: Mapping[str, Any]) -> None:
-        device = _dict(told.get("device"))
+    def _count(self, stated: Mapping[str, Any]) -> None:
+        device = _dict(stated.get("device"))
         if isinstance(device.get("name"), str) and len(self._devices) < MOST_LISTED:
             self._devices.add(f"{device['name']} ({device.get('platform', '')} {device.get('driver', '')})")
-        if isinstance(told.get("whitefurnace"), str) and len(self._versions) < MOST_LISTED:
-            self._versions.add(told["whitefurnace"])
+        if isinstance(stated.get("whitefurnace"), str) and len(self._versions) < MOST_LISTED:
+            self._versions.add(stated["whitefurnace"])
 
     def _larger(self, error: float | None, name: str) -> None:
         # The first by name of equal ones, in whatever order they come.
@@ -306,14 +306,14 @@ def _dimensions(path: Path) -> tuple[int, int]:
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
 
 
-# ------------------------------------------------------------------------------------------------- what is told
+# ------------------------------------------------------------------------------------------------- what is stated
 
 
 def _dict(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _number(value: Any) -> float | None:
+def _finite_number(value: Any) -> float | None:
     """A finite number that a manifest tells, None for anything else."""
     return float(value) if isinstance(value, int | float) and abs(value) < 1e300 else None
 
@@ -326,59 +326,59 @@ def _rows_in(value: Any) -> list[Mapping[str, Any]]:
     return [row for row in _list(value) if isinstance(row, Mapping)]
 
 
-def _levels(told: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+def _levels(stated: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Every level that states an error, the irradiance last."""
-    return [*(row for what in ("levels", "latlong_levels", "octahedral_levels") for row in _rows_in(told.get(what))),
-            _dict(told.get("irradiance"))]
+    return [*(row for what in ("levels", "latlong_levels", "octahedral_levels") for row in _rows_in(stated.get(what))),
+            _dict(stated.get("irradiance"))]
 
 
-def _size_of(told: Mapping[str, Any]) -> int:
-    files = [told] if isinstance(told.get("sha256"), str) else map(_dict, _dict(told.get("files")).values())
-    return sum(int(_number(entry.get("bytes")) or 0) for entry in files)
+def _size_of(stated: Mapping[str, Any]) -> int:
+    files = [stated] if isinstance(stated.get("sha256"), str) else map(_dict, _dict(stated.get("files")).values())
+    return sum(int(_finite_number(entry.get("bytes")) or 0) for entry in files)
 
 
-def _stored(told: Mapping[str, Any]) -> dict[str, float]:
+def _stored(stated: Mapping[str, Any]) -> dict[str, float]:
     """By engine, the error of its worst level and what the pixel format adds to that. Float32 adds nothing."""
     found: dict[str, float] = {}
-    for relative, entry in _dict(told.get("files")).items():
+    for relative, entry in _dict(stated.get("files")).items():
         for row in _rows_in(_dict(entry).get("levels")):
-            if (error := _number(row.get("error"))) is not None:
+            if (error := _finite_number(row.get("error"))) is not None:
                 name = str(relative).partition("/")[0]
-                found[name] = max(found.get(name, 0.0), error + (_number(row.get("format_p99")) or 0.0))
-    own = [name for name in ("raw", "exr") if name in _list(_dict(told.get("recipe")).get("for"))]
-    for row in _levels(told)[:-1]:
+                found[name] = max(found.get(name, 0.0), error + (_finite_number(row.get("format_p99")) or 0.0))
+    own = [name for name in ("raw", "exr") if name in _list(_dict(stated.get("recipe")).get("for"))]
+    for row in _levels(stated)[:-1]:
         for name in own:
-            if name in _list(row.get("for")) and (error := _number(row.get("error"))) is not None:
+            if name in _list(row.get("for")) and (error := _finite_number(row.get("error"))) is not None:
                 found[name] = max(found.get(name, 0.0), error)
     return dict(sorted(found.items()))
 
 
-def _notices(told: Mapping[str, Any]) -> list[str]:
+def _notices(stated: Mapping[str, Any]) -> list[str]:
     """What a manifest says that was said of its source and its formats."""
-    source = _dict(told.get("source"))
-    found = [*_list(source.get("notices")), *_list(told.get("notices"))]
+    source = _dict(stated.get("source"))
+    found = [*_list(source.get("notices")), *_list(stated.get("notices"))]
     with contextlib.suppress(KeyError, TypeError, ValueError, AttributeError, IndexError):  # not as ours are
-        found += format_notices(told)
+        found += format_notices(stated)
     return [notice for notice in found if isinstance(notice, str)]
 
 
-def _about(told: Mapping[str, Any]) -> str:
+def _about(stated: Mapping[str, Any]) -> str:
     """Layout, chain and engines of a bake, in a line."""
-    source, recipe = _dict(told.get("source")), _dict(told.get("recipe"))
+    source, recipe = _dict(stated.get("source")), _dict(stated.get("recipe"))
     statistics = _dict(source.get("statistics"))
     parts = [f"{source.get('layout', '')} {statistics.get('width', '')}×{statistics.get('height', '')}".strip(" ×")]
-    chain = _rows_in(told.get("levels")) or _rows_in(told.get("octahedral_levels"))
-    sizes = sorted({int(s) for row in chain if (s := _number(row.get("size"))) is not None}, reverse=True)
+    chain = _rows_in(stated.get("levels")) or _rows_in(stated.get("octahedral_levels"))
+    sizes = sorted({int(s) for row in chain if (s := _finite_number(row.get("size"))) is not None}, reverse=True)
     if sizes:
         parts.append(f"{sizes[0]}² to {sizes[-1]}²" if len(sizes) > 1 else f"{sizes[0]}²")
     parts.append(", ".join(map(str, _list(recipe.get("for")))))
     return " · ".join(part for part in parts if part)
 
 
-def _table_about(told: Mapping[str, Any]) -> str:
-    models = [str(_dict(one).get("name", "")) for one in _dict(told.get("models")).values()]
-    parts = [str(told.get("integral", "")), ", ".join(models),
-             " × ".join(map(str, _list(told.get("shape")))), str(told.get("rule", ""))]
+def _table_about(stated: Mapping[str, Any]) -> str:
+    models = [str(_dict(one).get("name", "")) for one in _dict(stated.get("models")).values()]
+    parts = [str(stated.get("integral", "")), ", ".join(models),
+             " × ".join(map(str, _list(stated.get("shape")))), str(stated.get("rule", ""))]
     return " · ".join(part for part in parts if part)
 
 
@@ -429,7 +429,8 @@ def _share(share: float | None) -> str:
 
 def _energy(rows: Sequence[Mapping[str, Any]]) -> str:
     """What the level that is furthest from it keeps of the energy; sorted by how far."""
-    kept = [(abs(e - 1), e, row.get("size")) for row in rows if (e := _number(row.get("energy_kept"))) is not None]
+    kept = [(abs(e - 1), e, row.get("size")) for row in rows
+            if (e := _finite_number(row.get("energy_kept"))) is not None]
     if not kept:
         return _cell(None, "–")
     off, e, size = max(kept, key=lambda one: one[0])

@@ -41,7 +41,7 @@ MOST_SEEN = 2_000_000
 MOST_TABLE = 1 << 34
 """Bytes of a table of a job. The command line's own may be larger: who types it sees it."""
 
-MOST_TOLD = 10
+MOST_REPORTED = 10
 
 
 class Bake(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_": "for"}, omit_defaults=True):
@@ -197,7 +197,7 @@ def job(path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = N
                         if (made := _converted(TABLES[name], entry, f"{name}[{k}]", wrong))]
     if not data and not wrong:
         wrong.append("it has no [[bake]] and no [[lut]]")
-    _tell(path, wrong)
+    _raise_all(path, wrong)
     base = Path(os.path.realpath(path)).parent
     maker = _Maker(path, base, Path(os.path.realpath(root if root is not None else base)), allow_kernels, force, device,
                    send, wrong)
@@ -215,7 +215,7 @@ def job(path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = N
         if len(maker.items) > MOST_ITEMS:
             raise InputError(f"{path}: {place} makes it over {MOST_ITEMS} items; split the job")
     maker.check_inputs()
-    _tell(path, wrong)
+    _raise_all(path, wrong)
     return maker.job()
 
 
@@ -240,10 +240,10 @@ def _parsed(path: Path) -> dict[str, Any]:
         raise InputError(f"{path} is not TOML: {error}") from None
 
 
-def _tell(path: Path, wrong: Sequence[str]) -> None:
+def _raise_all(path: Path, wrong: Sequence[str]) -> None:
     if wrong:
-        more = f"; and {len(wrong) - MOST_TOLD} more" if len(wrong) > MOST_TOLD else ""
-        raise InputError(f"{path}: {'; '.join(wrong[:MOST_TOLD])}{more}")
+        more = f"; and {len(wrong) - MOST_REPORTED} more" if len(wrong) > MOST_REPORTED else ""
+        raise InputError(f"{path}: {'; '.join(wrong[:MOST_REPORTED])}{more}")
 
 
 def _converted(kind: type[Bake] | type[Lut], entry: dict[str, Any], place: str, wrong: list[str]) -> Bake | Lut | None:
@@ -300,16 +300,16 @@ class _Maker:
             assert folder
             self.own.append(folder)
 
-    def _output(self, place: str, output: str, told: bool = False) -> Path | None:
+    def _output(self, place: str, output: str, report: bool = False) -> Path | None:
         """Where an output is, below the root, through no link that leads out of it."""
         if not output or "\0" in output:
-            self.wrong += [f"{place}.output is empty"] if told else []
+            self.wrong += [f"{place}.output is empty"] if report else []
             return None
         # Both: `..` after a link is the parent of where the link leads.
         plain, real = os.path.normpath(self.root / output), os.path.realpath(self.root / output)
         if all(_below(self.root, where) for where in (plain, real)):
             return Path(plain)
-        if told:
+        if report:
             self.wrong.append(f"{place}.output {output!r} is outside {self.root}; outputs are relative to the job "
                               "file's folder and stay below it, or below the folder of -o")
         return None
@@ -331,7 +331,7 @@ class _Maker:
         return found, True
 
     def bake(self, place: str, table: Bake) -> None:
-        output = self._output(place, table.output, told=True)
+        output = self._output(place, table.output, report=True)
         models, allowed = self._models(place, table)
         files = [str(self.base / name) if name.lower().endswith(".toml") else name for name in table.for_ or ()]
         for name in files:
@@ -401,7 +401,7 @@ class _Maker:
         return found
 
     def lut(self, place: str, table: Lut) -> None:
-        output = self._output(place, table.output, told=True)
+        output = self._output(place, table.output, report=True)
         models, allowed = self._models(place, table)
         if output is None or not allowed:
             return
@@ -805,7 +805,7 @@ def _on_one_device(items: Iterable[Item]) -> Iterator[Item]:
         yield msgspec.structs.replace(item, device=known[item.device])
 
 
-class Tally:
+class Summary:
     """Counts of results as they come, and the failures with their reasons. `begin` is when it was made."""
 
     def __init__(self, total: int) -> None:

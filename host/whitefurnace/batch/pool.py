@@ -80,12 +80,12 @@ def run(stages: Stages, items: Iterable[Any], *, workers: int = 1, scheduler: st
         raise UsageError(f"{workers} workers: give 1 to {MOST_WORKERS}")
     if scheduler is not None and workers != 1:
         raise UsageError("workers and a scheduler: a cluster has its own workers; give one of the two")
-    tell = on_notice or (lambda text: None)
-    with _Interrupts(stop or threading.Event(), tell) as interrupts:
+    report = on_notice or (lambda text: None)
+    with _Interrupts(stop or threading.Event(), report) as interrupts:
         if scheduler is not None:
-            _on_cluster(stages, items, scheduler, on_result, tell, interrupts)
+            _on_cluster(stages, items, scheduler, on_result, report, interrupts)
         elif workers > 1:
-            _Crew(stages, items, workers, on_result, tell, interrupts).run()
+            _Crew(stages, items, workers, on_result, report, interrupts).run()
         else:
             _here(stages, items, on_result, interrupts)
         if interrupts.count:
@@ -95,11 +95,11 @@ def run(stages: Stages, items: Iterable[Any], *, workers: int = 1, scheduler: st
 class _Interrupts:
     """Ctrl-C while it lasts: the first sets `stop`, the second raises KeyboardInterrupt in the main thread."""
 
-    def __init__(self, stop: threading.Event, tell: Callable[[str], None]) -> None:
+    def __init__(self, stop: threading.Event, report: Callable[[str], None]) -> None:
         self.stop = stop
         self.count = 0
-        self._tell = tell
-        self._told = False
+        self._report = report
+        self._reported = False
         self._before: Any = None
         self.main = threading.current_thread() is threading.main_thread()
 
@@ -120,9 +120,9 @@ class _Interrupts:
 
     def look(self) -> bool:
         """Whether to begin nothing new; says so once, outside of the signal's handler."""
-        if self.count and not self._told:
-            self._told = True
-            self._tell("finishing what is in flight; Ctrl-C again stops it")
+        if self.count and not self._reported:
+            self._reported = True
+            self._report("finishing what is in flight; Ctrl-C again stops it")
         return self.stop.is_set()
 
     @staticmethod
@@ -387,12 +387,12 @@ class _Crew:
     """The worker processes of a run."""
 
     def __init__(self, stages: Stages, items: Iterable[Any], count: int, on_result: Callable[[Any], None],
-                 tell: Callable[[str], None], interrupts: _Interrupts) -> None:
+                 report: Callable[[str], None], interrupts: _Interrupts) -> None:
         self.stages = stages
         self.source = enumerate(items)
         self.count = count
         self.on_result = on_result
-        self.tell = tell
+        self.report = report
         self.interrupts = interrupts
         self.workers: list[_Worker] = []
         self.again: deque[tuple[int, Any]] = deque()  # items whose worker died
@@ -518,7 +518,7 @@ class _Crew:
             if not worker.alone:
                 count = len(worker.items)
                 again = "its item is" if count == 1 else f"its {count} items are"
-                self.tell(f"worker {worker.number} {cause}" + (f"; {again} tried again" if count else ""))
+                self.report(f"worker {worker.number} {cause}" + (f"; {again} tried again" if count else ""))
         return self._start(worker.number)
 
     def _end(self, at_once: bool) -> None:
@@ -631,7 +631,7 @@ def _settle(beside: Mapping[str, int], dask_worker: Any) -> str:
 
 
 def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: Callable[[Any], None],
-                tell: Callable[[str], None], interrupts: _Interrupts) -> None:
+                report: Callable[[str], None], interrupts: _Interrupts) -> None:
     try:
         import distributed
     except ImportError:
@@ -647,7 +647,7 @@ def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: C
             raise FileError(f"no scheduler answers at {address}") from error
         except (ValueError, TypeError) as error:
             raise UsageError(f"{address!r} is no address of a scheduler: {error}; e.g. tcp://host:8786") from error
-        cluster = _Cluster(stages, items, address, client, on_result, tell, interrupts)
+        cluster = _Cluster(stages, items, address, client, on_result, report, interrupts)
         try:
             cluster.run()
         except BaseException:
@@ -666,13 +666,13 @@ class _Cluster:
     """A run on a Dask cluster; at no time are more than WINDOW items a worker submitted."""
 
     def __init__(self, stages: Stages, items: Iterable[Any], address: str, client: Any,
-                 on_result: Callable[[Any], None], tell: Callable[[str], None], interrupts: _Interrupts) -> None:
+                 on_result: Callable[[Any], None], report: Callable[[str], None], interrupts: _Interrupts) -> None:
         self.stages = stages
         self.source = enumerate(items)
         self.address = address
         self.client = client
         self.on_result = on_result
-        self.tell = tell
+        self.report = report
         self.interrupts = interrupts
         self.flying: dict[Any, Any] = {}  # future -> item
         self.landed: queue.SimpleQueue[Any] = queue.SimpleQueue()
@@ -723,7 +723,7 @@ class _Cluster:
         able = {name: facts["host"] for name, facts in workers.items() if facts["resources"].get(RESOURCE, 0) >= SHARE}
         if not able and not self.lonely:
             self.lonely = True
-            self.tell(f"waiting: no worker at {self.address} declares {RESOURCE}=1 "
+            self.report(f"waiting: no worker at {self.address} declares {RESOURCE}=1 "
                       f"(dask worker {self.address} --nthreads 4 --resources {RESOURCE}=1)")
         fresh = [name for name in able if name not in self.settled]
         if fresh:

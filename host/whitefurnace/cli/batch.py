@@ -14,7 +14,7 @@ from whitefurnace.cli.terminal import print_row, say
 from whitefurnace.text import size
 
 if TYPE_CHECKING:
-    from whitefurnace.batch.jobs import Result, Tally
+    from whitefurnace.batch.jobs import Result, Summary
 
 EPILOG = """\b
 Examples:
@@ -76,11 +76,11 @@ def batch(job: Path, root: Path | None, page: Path | None, depfile: Path | None,
     made = batching.job(job, root=root, allow_kernels=allow_kernels, force=force, device=device, send=send)
     if part:
         made = made.shard(*part)
-    tally = batching.Tally(len(made.items))
+    summary = batching.Summary(len(made.items))
     results: list[Result] = []
 
     def report(result: Result) -> None:
-        tally.add(result)
+        summary.add(result)
         if depfile is not None:
             results.append(result)
         _print_result(result, as_json, quiet)
@@ -91,7 +91,7 @@ def batch(job: Path, root: Path | None, page: Path | None, depfile: Path | None,
                 report(result)
         else:
             written = print_row if as_json else None if quiet else lambda row: click.echo(f"report: {row['file']}")
-            with _page(page, job.name, force, tally, written) as add, _bar(tally, not (quiet or as_json)) as show:
+            with _page(page, job.name, force, summary, written) as add, _bar(summary, not (quiet or as_json)) as show:
                 def on_result(result: Result) -> None:
                     report(result)
                     add(result)
@@ -102,11 +102,11 @@ def batch(job: Path, root: Path | None, page: Path | None, depfile: Path | None,
         if depfile is not None and not dry_run:
             batching.depfile(made, results, depfile)
     finally:
-        _print_tally(tally, as_json, quiet)
-    if tally.failed:
-        codes = {result.exit_code for result in tally.failed}
-        kind = errors.of_code(codes.pop()) if len(codes) == 1 and len(tally.failed) == tally.total else None
-        raise (kind or errors.PartialError)(f"{len(tally.failed)} of {tally.total} items failed")
+        _print_summary(summary, as_json, quiet)
+    if summary.failed:
+        codes = {result.exit_code for result in summary.failed}
+        kind = errors.of_code(codes.pop()) if len(codes) == 1 and len(summary.failed) == summary.total else None
+        raise (kind or errors.PartialError)(f"{len(summary.failed)} of {summary.total} items failed")
 
 
 def _print_result(result: Result, as_json: bool, quiet: bool) -> None:
@@ -119,19 +119,19 @@ def _print_result(result: Result, as_json: bool, quiet: bool) -> None:
         say(f"notice: {result.place}: {notice}")
 
 
-def _print_tally(tally: Tally, as_json: bool, quiet: bool) -> None:
+def _print_summary(summary: Summary, as_json: bool, quiet: bool) -> None:
     """Print the failures and the summary of a batch."""
     if as_json:
-        print_row(tally_row(tally))
+        print_row(summary_row(summary))
         return
-    for line in failures_text(tally):
+    for line in failures_text(summary):
         say(line)
     if not quiet:
-        click.echo(tally_text(tally))
+        click.echo(summary_text(summary))
 
 
 @contextlib.contextmanager
-def _page(folder: Path | None, title: str, force: bool, tally: Tally,
+def _page(folder: Path | None, title: str, force: bool, summary: Summary,
           written: Callable[[Mapping[str, Any]], None] | None) -> Iterator[Callable[[Any], None]]:
     """The HTML page of a batch: gives a function that adds an item. The page is written also when the batch is stopped.
     `written` is called with a row that names the page."""
@@ -144,14 +144,14 @@ def _page(folder: Path | None, title: str, force: bool, tally: Tally,
         try:
             yield page.add
         finally:
-            if tally.count:  # else the page of an earlier run stays
-                path = page.close(total=tally.total)
+            if summary.count:  # else the page of an earlier run stays
+                path = page.close(total=summary.total)
                 if written is not None:
                     written({"event": "report", "file": str(path)})
 
 
 @contextlib.contextmanager
-def _bar(tally: Tally, wanted: bool) -> Iterator[Callable[[], None]]:
+def _bar(summary: Summary, wanted: bool) -> Iterator[Callable[[], None]]:
     """A bar on stderr, where that is a terminal: the rate, the time left and the number of failures."""
     if not wanted or not sys.stderr.isatty():
         yield lambda: None
@@ -161,8 +161,8 @@ def _bar(tally: Tally, wanted: bool) -> Iterator[Callable[[], None]]:
 
     columns = (MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}"), TimeRemainingColumn(compact=True))
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=tally.total)
-        yield lambda: bar.update(task, completed=tally.count, description=rate_text(tally))
+        task = bar.add_task("", total=summary.total)
+        yield lambda: bar.update(task, completed=summary.count, description=rate_text(summary))
 
 
 def result_row(result: Result) -> dict[str, Any]:
@@ -191,34 +191,35 @@ def result_text(result: Result) -> str:
     return ""
 
 
-def rate_text(tally: Tally) -> str:
+def rate_text(summary: Summary) -> str:
     """The items per second and the failures so far."""
-    failed = f", {len(tally.failed)} failed" if tally.failed else ""
-    return f"{tally.count / max(tally.wall, 1e-9):.3g}/s{failed}"
+    failed = f", {len(summary.failed)} failed" if summary.failed else ""
+    return f"{summary.count / max(summary.wall, 1e-9):.3g}/s{failed}"
 
 
-def failures_text(tally: Tally) -> list[str]:
+def failures_text(summary: Summary) -> list[str]:
     """A line for each failure with its reason."""
-    return [f"failed: {result.place}: {result.message} (exit code {result.exit_code})" for result in tally.failed]
+    return [f"failed: {result.place}: {result.message} (exit code {result.exit_code})" for result in summary.failed]
 
 
-def tally_text(tally: Tally) -> str:
+def summary_text(summary: Summary) -> str:
     """The summary of a batch in one line."""
     states = {"done": "done", "planned": "to do", "skipped": "up to date", "failed": "failed"}
-    if tally.total and tally.states["skipped"] == tally.total:
-        return f"{tally.total} items, all up to date: nothing to do; {tally.wall:.2f} s"
-    counts = [f"{tally.states[state]} {text}" for state, text in states.items() if tally.states[state]]
-    left = tally.total - tally.count
+    if summary.total and summary.states["skipped"] == summary.total:
+        return f"{summary.total} items, all up to date: nothing to do; {summary.wall:.2f} s"
+    counts = [f"{summary.states[state]} {text}" for state, text in states.items() if summary.states[state]]
+    left = summary.total - summary.count
     counts += [f"{left} not begun"] if left else []
-    line = f"{tally.total} items: {', '.join(counts) or 'none'}; {size(tally.nbytes)}"
-    if tally.states["planned"]:
-        return line + f", about {tally.predicted['cpu_seconds']:.2g} s of processor time, " \
-                      f"{size(tally.predicted['memory'])} of memory a worker"
-    return line + f", {tally.wall:.2f} s (" + ", ".join(f"{name} {s:.2f}" for name, s in tally.seconds.items()) + ")"
+    line = f"{summary.total} items: {', '.join(counts) or 'none'}; {size(summary.nbytes)}"
+    if summary.states["planned"]:
+        return line + f", about {summary.predicted['cpu_seconds']:.2g} s of processor time, " \
+                      f"{size(summary.predicted['memory'])} of memory a worker"
+    stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in summary.seconds.items())
+    return line + f", {summary.wall:.2f} s ({stages})"
 
 
-def tally_row(tally: Tally) -> dict[str, Any]:
+def summary_row(summary: Summary) -> dict[str, Any]:
     """The JSON row of the summary, with every failure."""
-    return {"event": "summary", "items": tally.total, **tally.states, "bytes": tally.nbytes, "wall": tally.wall,
-            "seconds": tally.seconds, **({"predicted": tally.predicted} if tally.states["planned"] else {}),
-            "failures": [{"place": r.place, "message": r.message, "exit_code": r.exit_code} for r in tally.failed]}
+    return {"event": "summary", "items": summary.total, **summary.states, "bytes": summary.nbytes, "wall": summary.wall,
+            "seconds": summary.seconds, **({"predicted": summary.predicted} if summary.states["planned"] else {}),
+            "failures": [{"place": r.place, "message": r.message, "exit_code": r.exit_code} for r in summary.failed]}
