@@ -1,1 +1,1 @@
-"""Runs many bakes and tables from one job file on processes or a cluster."""
+"""Runs many bakes and tables from one job file, in processes or on a cluster."""

@@ -1,5 +1,7 @@
-"""What a batch made as one page of HTML: a row an environment, with pictures of its levels and what is stated of them.
-It opens from disk, asks for nothing from a network, and is the same bytes for the same results."""
+"""Writes the results of a batch as one HTML page: a row for each environment, with a thumbnail and the stated errors.
+
+The page opens from disk, loads nothing from a network, and has the same bytes for the same results.
+"""
 from __future__ import annotations
 
 import base64
@@ -25,17 +27,19 @@ from whitefurnace.text import size as bytes_text
 INDEX, THUMBNAILS = "index.html", "strips"
 OURS = b'<meta name="generator" content="whitefurnace">'
 MANY = 500
-"""Rows of which a browser lays out only those in sight."""
+"""Number of rows above which a browser lays out only the visible ones."""
 
 NO_TEXT = re.compile("[\0-\x1f\x7f-\x9f\ufdd0-\ufdef\ufffe\uffff]")
-"""Controls and what is no character: a page may not hold them [HTML, 13.2.3.5]."""
+"""Controls and noncharacters, which an HTML page must not contain [HTML, 13.2.3.5]."""
 
 FEW = 8
-"""Environments that are seen at a glance: a page of more has a field to find them."""
+"""Number of environments above which a page has a search field."""
 
 MOST_LISTED = 20
+"""Largest number of notices of an item on a page."""
+
 MOST_TEXT = 600
-"""How many notices of an item, and characters of a name or a notice, a page repeats."""
+"""Largest number of characters of a name or a notice on a page."""
 
 BAKES = (("Environment", "text"), ("Largest error", ""), ("As stored", ""), ("Time", ""), ("Size", ""),
          ("Sun share", ""), ("Energy kept", ""), ("Notices", ""))
@@ -55,8 +59,11 @@ FAILED = (("Item", "text"), ("Reason", "text"), ("Exit code", ""))
 
 def write_gallery(folder: str | os.PathLike[str], results: Iterable[Result], *, title: str = "Bakes",
                   force: bool = False) -> Path:
-    """The page of `results`, DIR/index.html, with pictures in DIR/strips. Raises FileError for what cannot be read or
-    written, and for a page that is not ours unless `force` says so."""
+    """Write the page of `results`, FOLDER/index.html, with pictures in FOLDER/strips; return its path.
+
+    Raises FileError for a file that cannot be read or written, and, without `force`, for an index.html that this tool
+    did not write.
+    """
     with Gallery(folder, title=title, force=force) as gallery:
         for result in results:
             gallery.add(result)
@@ -64,7 +71,7 @@ def write_gallery(folder: str | os.PathLike[str], results: Iterable[Result], *, 
 
 
 def found_in(output: str | os.PathLike[str]) -> Iterator[Result]:
-    """What the manifests in a folder of outputs, and in those below it, tell of, in the order of their paths."""
+    """Yield a result for each manifest in a folder of outputs and in the folders below it, in the order of paths."""
     output = Path(output)
     for path in sorted(output.rglob("*.json")):
         stated = None if path.name.startswith(".") else read_manifest(path)
@@ -78,7 +85,10 @@ def found_in(output: str | os.PathLike[str]) -> Iterator[Result]:
 
 
 class Gallery:
-    """A page in the making: rows come as items end, in any order, and wait on disk, so that memory stays flat."""
+    """A page that is written while a batch runs.
+
+    Rows are added as items end, in any order. They are kept on disk, so that memory does not grow.
+    """
 
     def __init__(self, folder: str | os.PathLike[str], *, title: str, force: bool = False) -> None:
         self.folder = Path(folder)
@@ -100,8 +110,10 @@ class Gallery:
         self._spool.close()
 
     def add(self, result: Result) -> None:
-        """A row of what became of an item; nothing of one that was only planned. What goes wrong on the way is for
-        `close` to raise: the batch goes on."""
+        """Add the row of an item; planned items have none.
+
+        An error is kept for `close` to raise, so that the batch goes on.
+        """
         if result.state not in self._states:
             return
         self._states[result.state] += 1
@@ -117,8 +129,10 @@ class Gallery:
         self._rows[kind].append((result.index, len(self._rows[kind]), at, len(data)))
 
     def close(self, *, total: int | None = None) -> Path:
-        """Writes the page and removes pictures that it does not show. `total` is how many items there are, where not
-        all of them ended: then pictures stay. Raises FileError."""
+        """Write the page, and remove pictures that it does not show; return its path.
+
+        total: number of items of the batch. If not all of them have ended, no picture is removed. Raises FileError.
+        """
         count = sum(self._states.values())
         path = self.folder / INDEX
         begin, end = self._page(count if total is None else total)
@@ -143,7 +157,7 @@ class Gallery:
         return path
 
     def _sweep(self) -> None:
-        with contextlib.suppress(OSError):  # there is no picture
+        with contextlib.suppress(OSError):  # the folder does not exist
             for entry in os.scandir(self.folder / THUMBNAILS):
                 if re.fullmatch(r"\.?[0-9a-f]{32}-\d+\.png(\.tmp)?", entry.name) and entry.name not in self._thumbnails:
                     os.unlink(entry.path)
@@ -189,7 +203,7 @@ class Gallery:
         return f'<tr><th scope="row">{first}</th>{cells}</tr>\n'
 
     def _thumbnail(self, result: Result, stated: Mapping[str, Any]) -> str:
-        """The picture of a bake, made where there is none of its key."""
+        """Return the HTML of the thumbnail of a bake. The picture is drawn unless one with the bake's key exists."""
         key = stated.get("key")
         if not isinstance(key, str) or not re.fullmatch("[0-9a-f]{64}", key):
             return '<span class="small none">no picture: its manifest has no key</span>'
@@ -217,12 +231,12 @@ class Gallery:
             self._versions.add(stated["whitefurnace"])
 
     def _larger(self, error: float | None, name: str) -> None:
-        # The first by name of equal ones, in whatever order they come.
+        # Of equal errors keep the first by name, so that the page does not depend on the order of results.
         if error is not None and (self._error is None or (-error, name) < (-self._error[0], self._error[1])):
             self._error = error, name
 
     def _page(self, total: int) -> tuple[str, str]:
-        """What stands before and after the tables."""
+        """Return the HTML before and after the tables."""
         count = sum(self._states.values())
         tiles = [("items", f"{total}", "")]
         tiles += [(what, f"{self._states[state]}", "failed" if state == "failed" else "")
@@ -248,7 +262,10 @@ class Gallery:
 
 
 def _checked(folder: Path, force: bool) -> IO[bytes]:
-    """A spool for rows, where the folder can be made and holds no page but ours. Raises FileError."""
+    """Make the folder and return a temporary file for rows.
+
+    Raises FileError, also where the folder has an index.html that this tool did not write and `force` is False.
+    """
     path = folder / INDEX
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -269,7 +286,10 @@ def _file_error(error: Exception, folder: Path) -> WhitefurnaceError:
 
 
 def _policy(page: str) -> str:
-    """What the page may do [CSP 3]: its own style and script, by their digests, and images of its folder."""
+    """Return the content security policy of the page [CSP 3].
+
+    It allows the page's own style and script, by their digests, and images in its folder.
+    """
     def digest(tag: str) -> str:
         body = page.partition(f"<{tag}>")[2].partition(f"</{tag}>")[0]
         return f"'sha256-{base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()}'"
@@ -298,7 +318,7 @@ def _attribute(name: str, value: str) -> str:
 
 
 def _dimensions(path: Path) -> tuple[int, int]:
-    """Width and height of a PNG, from its header [PNG 3, 11.2.1]."""
+    """Read the width and height of a PNG from its header [PNG 3, 11.2.1]."""
     with open(path, "rb") as file:
         head = file.read(24)
     if len(head) < 24 or head[12:16] != b"IHDR":
@@ -306,15 +326,16 @@ def _dimensions(path: Path) -> tuple[int, int]:
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
 
 
-# ------------------------------------------------------------------------------------------------- what is stated
+# ------------------------------------------------------------------------------------------------- manifests
 
 
 def _dict(value: Any) -> Mapping[str, Any]:
+    """Return the value if it is a mapping, else an empty one."""
     return value if isinstance(value, Mapping) else {}
 
 
 def _finite_number(value: Any) -> float | None:
-    """A finite number that a manifest tells, None for anything else."""
+    """Return a finite number of a manifest as a float; None for any other value."""
     return float(value) if isinstance(value, int | float) and abs(value) < 1e300 else None
 
 
@@ -327,7 +348,7 @@ def _rows_in(value: Any) -> list[Mapping[str, Any]]:
 
 
 def _levels(stated: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Every level that states an error, the irradiance last."""
+    """Return the rows of all levels of a manifest, the irradiance last."""
     return [*(row for what in ("levels", "latlong_levels", "octahedral_levels") for row in _rows_in(stated.get(what))),
             _dict(stated.get("irradiance"))]
 
@@ -338,7 +359,7 @@ def _size_of(stated: Mapping[str, Any]) -> int:
 
 
 def _stored(stated: Mapping[str, Any]) -> dict[str, float]:
-    """By engine, the error of its worst level and what the pixel format adds to that. Float32 adds nothing."""
+    """Return, by engine, the largest error of a level with that of its pixel format. Float32 adds no error."""
     found: dict[str, float] = {}
     for relative, entry in _dict(stated.get("files")).items():
         for row in _rows_in(_dict(entry).get("levels")):
@@ -354,16 +375,16 @@ def _stored(stated: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _notices(stated: Mapping[str, Any]) -> list[str]:
-    """What a manifest says that was said of its source and its formats."""
+    """Return the notices in a manifest about the source and the pixel formats."""
     source = _dict(stated.get("source"))
     found = [*_list(source.get("notices")), *_list(stated.get("notices"))]
-    with contextlib.suppress(KeyError, TypeError, ValueError, AttributeError, IndexError):  # not as ours are
+    with contextlib.suppress(KeyError, TypeError, ValueError, AttributeError, IndexError):  # a foreign manifest
         found += format_notices(stated)
     return [notice for notice in found if isinstance(notice, str)]
 
 
 def _about(stated: Mapping[str, Any]) -> str:
-    """Layout, chain and engines of a bake, in a line."""
+    """Return layout, sizes of levels and engines of a bake, in one line."""
     source, recipe = _dict(stated.get("source")), _dict(stated.get("recipe"))
     statistics = _dict(source.get("statistics"))
     parts = [f"{source.get('layout', '')} {statistics.get('width', '')}×{statistics.get('height', '')}".strip(" ×")]
@@ -376,6 +397,7 @@ def _about(stated: Mapping[str, Any]) -> str:
 
 
 def _table_about(stated: Mapping[str, Any]) -> str:
+    """Return integral, models, shape and rule of a table, in one line."""
     models = [str(_dict(one).get("name", "")) for one in _dict(stated.get("models")).values()]
     parts = [str(stated.get("integral", "")), ", ".join(models),
              " × ".join(map(str, _list(stated.get("shape")))), str(stated.get("rule", ""))]
@@ -386,8 +408,11 @@ def _table_about(stated: Mapping[str, Any]) -> str:
 
 
 def _text(text: Any) -> str:
-    """Text that others chose, as HTML: what is no character of a page (controls, halves of surrogates, which names of
-    files may have) is written out, and what is too long is cut."""
+    """Escape untrusted text for HTML.
+
+    Characters that a page must not contain, such as controls and lone surrogates in file names, are written as escape
+    sequences. Long text is cut at MOST_TEXT.
+    """
     text = str(text).encode("utf-8", "backslashreplace").decode()
     if len(text) > MOST_TEXT:
         text = text[: MOST_TEXT - 1] + "…"
@@ -395,7 +420,7 @@ def _text(text: Any) -> str:
 
 
 def _link(path: str, folder: Path) -> str | None:
-    """A relative address of a file; None where there is none, on another drive."""
+    """Return the address of a file relative to `folder`; None where it is on another drive."""
     try:
         relative = os.path.relpath(os.path.abspath(path), os.path.abspath(folder))
     except ValueError:
@@ -419,7 +444,7 @@ def _cell(value: float | None, shown: str) -> str:
 
 
 def _share(share: float | None) -> str:
-    """A share of 1, with a bar."""
+    """Return a cell with a fraction of 1 as a percentage and a bar."""
     if share is None:
         return _cell(None, "–")
     width = 80 * min(max(share, 0.0), 1.0)
@@ -428,7 +453,7 @@ def _share(share: float | None) -> str:
 
 
 def _energy(rows: Sequence[Mapping[str, Any]]) -> str:
-    """What the level that is furthest from it keeps of the energy; sorted by how far."""
+    """Return a cell with the energy kept by the level furthest from 100 %; it sorts by that distance."""
     kept = [(abs(e - 1), e, row.get("size")) for row in rows
             if (e := _finite_number(row.get("energy_kept"))) is not None]
     if not kept:

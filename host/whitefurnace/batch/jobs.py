@@ -1,5 +1,8 @@
-"""Many recipes: a job file checked whole before anything runs, its items, and one function that does one of them, the
-same in this process, in a worker and on a cluster."""
+"""Reads the job file of `batch`, and runs its items.
+
+The whole job is checked before any item runs. An item runs by the same functions in this process, in a worker process
+and on a cluster.
+"""
 from __future__ import annotations
 
 import contextlib
@@ -10,6 +13,7 @@ import os
 import re
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -17,7 +21,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-import tomllib
 
 from whitefurnace.baking import bake as baking
 from whitefurnace.baking.request import BakeRequest
@@ -32,20 +35,21 @@ from whitefurnace.tables import lut as tables
 from whitefurnace.tables.axes import named, named_axes
 
 MOST_BYTES = 16 << 20
-"""Of a job file: ten thousand paths take about one."""
+"""Largest size of a job file; ten thousand paths take about one megabyte."""
 
 MOST_ITEMS = 1_000_000
 MOST_SEEN = 2_000_000
-"""Names in folders that all patterns of a job may be compared with: some seconds of work."""
+"""Largest number of names in folders that are compared with the patterns of a job: a few seconds of work."""
 
 MOST_TABLE = 1 << 34
-"""Bytes of a table of a job. The command line's own may be larger: who types it sees it."""
+"""Largest size of a table in a job, in bytes. `lut` has no such limit, because its user typed the size."""
 
 MOST_REPORTED = 10
+"""Largest number of mistakes in the error message of a job."""
 
 
 class Bake(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_": "for"}, omit_defaults=True):
-    """A `[[bake]]`: environments (paths and patterns), the output folder, and the options of `bake`."""
+    """A table `[[bake]]` of a job: environments (paths and patterns), the output folder, and options of `bake`."""
 
     environments: list[str]
     output: str
@@ -71,7 +75,10 @@ class Bake(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for
 
 
 class Lut(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_": "for"}, omit_defaults=True):
-    """A `[[lut]]`: kind, the output file, and the options of `lut`; `axis` and `set` are lists of what these take."""
+    """A table `[[lut]]` of a job: kind, output file, and options of `lut`.
+
+    `axis` and `set` are lists of the values of these options.
+    """
 
     kind: str
     output: str
@@ -101,17 +108,21 @@ class Lut(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_
 
 TABLES: dict[str, type[Bake] | type[Lut]] = {"bake": Bake, "lut": Lut}
 MODELS = ("ndf", "masking", "fresnel", "diffuse", "brdf", "light")
-"""Options that name models, and may name a user's file."""
+"""Options that name a model, or a file with a user's model."""
 
 
 class Item(msgspec.Struct, frozen=True):
-    """One environment or one table: all that a worker needs to do it, as plain data.
+    """One environment to bake or one table to make, as plain data that a worker can receive.
 
-    place    where it stands in the job, for people
-    source   the path of the environment, or the word demo; of a table its kind
-    output   the folder of a bake, the file of a table; `root` is the folder that it stays under
+    index    number of the item in the job
+    place    its place in the job file, for messages
+    name     stem of the files of a bake, or file name of a table
+    source   path of the environment, or the word demo; for a table its kind
+    output   folder of a bake, or file of a table; it must stay below the folder `root`
     recipe   the options as JSON, with the digests of the files that they name
-    send     whether a cluster gets the source by value; `content` are then its files, by name
+    force    whether outputs are made again, and files of others overwritten
+    device   the OpenCL device to use, or None for the default
+    send     whether the source is sent to a cluster by value; `content` then holds its files by name
     """
 
     index: int
@@ -129,9 +140,17 @@ class Item(msgspec.Struct, frozen=True):
 
 
 class Result(msgspec.Struct, frozen=True):
-    """What became of an item: `done`, `skipped`, `failed` or `planned`. `seconds` of wall time went into reading,
-    computing and writing; `error` is the largest that a level, or the table, states. `predicted` are processor seconds
-    and bytes of memory of what would be baked."""
+    """The result of an item.
+
+    state      done, skipped (up to date), failed, or planned (in a dry run)
+    manifest   path of the manifest
+    seconds    wall time of reading, computing and writing
+    nbytes     size of all files; `files` has the size of each by its path
+    error      the largest error that a level, or the table, states
+    predicted  for a planned bake, processor seconds and bytes of memory
+    message    reason of a failure; `exit_code` is that of its error
+    The other fields are those of the item.
+    """
 
     index: int
     kind: str
@@ -155,8 +174,14 @@ class Result(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Job:
-    """A checked job: its items in their order, the files that recipes name, the folders that patterns were looked for
-    in, and the folders of outputs that are not there yet, innermost first."""
+    """A checked job.
+
+    path     the job file; `root` is the folder that outputs stay below
+    items    its items in order
+    named    files that recipes name: models, engines and environments of tables
+    looked   folders that were searched for patterns
+    folders  folders of outputs that do not exist yet, innermost first
+    """
 
     path: Path
     root: Path
@@ -166,22 +191,26 @@ class Job:
     folders: tuple[Path, ...]
 
     def shard(self, k: int, n: int) -> Job:
-        """Every n-th item from the k-th (of 1 … n) on: items that are added at the end move no other."""
+        """Return the job with every n-th item from the k-th on, k from 1 to n.
+
+        An item that is added at the end of a job does not move the others to another shard.
+        """
         return replace(self, items=self.items[k - 1::n])
 
     def predicted(self) -> Iterator[Result]:
-        """Each item as it would go, from headers and digests: what is up to date, what would be written, what fails."""
+        """Predict the result of each item from headers and digests, without running it."""
         return map(predict, self.items)
 
 
 def job(path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = None, allow_kernels: bool = False,
         force: bool = False, device: str | None = None, send: bool = False) -> Job:
-    """The job of a TOML file, checked whole: nothing has run, and nothing was decoded.
+    """Read a job file (TOML) and check it completely. No item runs, and no image is decoded.
 
-    root: outputs are under it, the job file's folder by default. allow_kernels: whether recipes may name `.clh` files,
-    whose text a device runs. send: sources go to a cluster by value. Raises FileError for what cannot be read,
-    InputError for what is no job: unknown keys, impossible values, patterns without a match, outputs outside `root`,
-    two recipes that write one file.
+    root: the folder that outputs stay below, by default that of the job file. allow_kernels: whether recipes may name
+    `.clh` files, whose text runs on the device. force: make all outputs again, and overwrite files of others. device:
+    the OpenCL device of all items. send: send sources to a cluster by value.
+    Raises FileError for a file that cannot be read, and InputError for an invalid job: unknown keys, impossible values,
+    patterns without a match, outputs outside `root`, or two recipes that write the same file.
     """
     path = Path(path)
     data = _parsed(path)
@@ -220,7 +249,7 @@ def job(path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = N
 
 
 def shard_of(text: str) -> tuple[int, int]:
-    """(I, N) of `I/N`. Raises UsageError."""
+    """Parse a shard `I/N` with 1 <= I <= N to (I, N). Raises UsageError."""
     found = re.fullmatch(r"\s*(\d{1,7})\s*/\s*(\d{1,7})\s*", text)
     if not found or not 1 <= int(found[1]) <= int(found[2]):
         raise UsageError(f"shard {text!r} is not I/N with 1 <= I <= N")
@@ -241,12 +270,14 @@ def _parsed(path: Path) -> dict[str, Any]:
 
 
 def _raise_all(path: Path, wrong: Sequence[str]) -> None:
+    """Raise InputError with all mistakes of a job, if there are any."""
     if wrong:
         more = f"; and {len(wrong) - MOST_REPORTED} more" if len(wrong) > MOST_REPORTED else ""
         raise InputError(f"{path}: {'; '.join(wrong[:MOST_REPORTED])}{more}")
 
 
 def _converted(kind: type[Bake] | type[Lut], entry: dict[str, Any], place: str, wrong: list[str]) -> Bake | Lut | None:
+    """Convert a table of the job file to its type; on a mistake, add it to `wrong` and return None."""
     known = [name.rstrip("_") for name in kind.__struct_fields__]
     given: dict[str, Any] = {}
     for key, value in entry.items():
@@ -268,7 +299,7 @@ def _converted(kind: type[Bake] | type[Lut], entry: dict[str, Any], place: str, 
 
 
 class _Maker:
-    """Makes items of tables, and finds what cannot be meant."""
+    """Makes the items of a job from its tables, and collects the mistakes in `wrong`."""
 
     def __init__(self, path: Path, base: Path, root: Path, allow_kernels: bool, force: bool, device: str | None,
                  send: bool, wrong: list[str]) -> None:
@@ -276,11 +307,11 @@ class _Maker:
         self.allow_kernels, self.force, self.device, self.send = allow_kernels, force, device, send
         self.wrong = wrong
         self.items: list[Item] = []
-        self.owner: dict[str, str] = {}  # of each file that is written: the place of its item
+        self.owner: dict[str, str] = {}  # by file that is written: the place of its item
         self.named: dict[Path, None] = {}
         self.finder = _Finder()
-        self.own: list[Path] = []  # output folders: patterns do not look into them
-        self.folders: set[Path] = set()  # every folder that is written into, and those that they are in
+        self.own: list[Path] = []  # output folders, which patterns do not search
+        self.folders: set[Path] = set()  # every folder that is written to, and their parents below the root
 
     def job(self) -> Job:
         missing = sorted((folder for folder in self.folders if not folder.exists()), reverse=True)
@@ -288,6 +319,7 @@ class _Maker:
                    tuple(missing))
 
     def _into(self, folder: Path) -> None:
+        """Note a folder that is written to, and its parents."""
         while folder not in self.folders and folder != self.root and _below(self.root, folder):
             self.folders.add(folder)
             folder = folder.parent
@@ -296,16 +328,20 @@ class _Maker:
         self.wrong.append(f"{place}: {error}")
 
     def outputs(self, place: str, table: Bake) -> None:
+        """Note the output folder of a bake. All are noted first, because patterns do not search them."""
         if (folder := self._output(place, table.output)) not in (None, self.root):
             assert folder
             self.own.append(folder)
 
     def _output(self, place: str, output: str, report: bool = False) -> Path | None:
-        """Where an output is, below the root, through no link that leads out of it."""
+        """Return the absolute path of an output; None where it is not below the root, links followed.
+
+        report: whether a mistake is added to `wrong`.
+        """
         if not output or "\0" in output:
             self.wrong += [f"{place}.output is empty"] if report else []
             return None
-        # Both: `..` after a link is the parent of where the link leads.
+        # Both paths must be below the root: `..` after a link is the parent of the link's target.
         plain, real = os.path.normpath(self.root / output), os.path.realpath(self.root / output)
         if all(_below(self.root, where) for where in (plain, real)):
             return Path(plain)
@@ -315,7 +351,7 @@ class _Maker:
         return None
 
     def _models(self, place: str, table: Bake | Lut) -> tuple[dict[str, str], bool]:
-        """Options that name files of kernels, their paths made absolute; whether they are allowed."""
+        """Return the options that name kernel files, with absolute paths, and whether kernels are allowed."""
         found = {}
         for option in MODELS:
             spec = getattr(table, option, None)
@@ -331,6 +367,7 @@ class _Maker:
         return found, True
 
     def bake(self, place: str, table: Bake) -> None:
+        """Add an item for each environment of a `[[bake]]`."""
         output = self._output(place, table.output, report=True)
         models, allowed = self._models(place, table)
         files = [str(self.base / name) if name.lower().endswith(".toml") else name for name in table.for_ or ()]
@@ -367,7 +404,7 @@ class _Maker:
             sources |= dict.fromkeys(found)
         if not table.environments:
             self.wrong.append(f"{place}.environments is empty")
-        # Every name of a file has the stem in it: what one item writes tells what each writes.
+        # Every file name contains the stem, so the files of one item give the files of each.
         relative = [os.path.relpath(t.path, output) for t in baking.targets_of(order, _STEM)] + [f"{_STEM}.json"]
         for one in relative:
             self._into((output / one).parent)
@@ -383,17 +420,18 @@ class _Maker:
                                    self.force, self.device, self.send))
 
     def _environments(self, pattern: str) -> list[str]:
+        """Return the paths that a path or pattern names, or the word demo. Raises InputError where there are none."""
         if "\0" in pattern or not pattern:
             raise InputError("an empty path")
         own = self.base / pattern
-        if os.path.lexists(own):  # a path wins over the word demo, and over a pattern
+        if os.path.lexists(own):  # an existing path has priority over the word demo and over patterns
             return [str(own)]
         if pattern == baking.DEMO:
             return [pattern]
         if not re.search(r"[*?\[]", pattern):
             raise InputError(f"{pattern!r} is not there")
         found = self.finder.find(self.base, pattern)
-        # What this job wrote the last time is not what it is made from.
+        # Outputs of an earlier run of this job are not its inputs.
         inside = [folder for folder in self.own if not _below(folder, os.path.normpath(self.base / _fixed(pattern)))]
         found = [one for one in found if not any(_below(folder, one) for folder in inside)]
         if not found:
@@ -401,6 +439,7 @@ class _Maker:
         return found
 
     def lut(self, place: str, table: Lut) -> None:
+        """Add the item of a `[[lut]]`."""
         output = self._output(place, table.output, report=True)
         models, allowed = self._models(place, table)
         if output is None or not allowed:
@@ -422,7 +461,7 @@ class _Maker:
         except (FileError, InputError) as error:
             if table.environment is None:
                 self.say(place, error)
-                return  # else this item fails, the others are done
+                return  # an environment that cannot be read fails this item alone, when it runs
         except WhitefurnaceError as error:
             self.say(place, error)
             return
@@ -433,6 +472,7 @@ class _Maker:
                                recipe, self.force, self.device))
 
     def _take(self, place: str, files: Iterable[str]) -> None:
+        """Note the files that an item writes; it is a mistake if another item writes one of them."""
         for file in files:
             other = self.owner.setdefault(os.path.normcase(file), place)
             if other is not place:
@@ -440,6 +480,7 @@ class _Maker:
                 return
 
     def check_inputs(self) -> None:
+        """Add a mistake for each item that reads a file which the job writes."""
         for item in self.items:
             if item.kind == "bake" and (writer := self.owner.get(os.path.normcase(os.path.normpath(item.source)))):
                 self.wrong.append(f"{item.place} is read, and written by {writer}")
@@ -449,25 +490,28 @@ _STEM = "STEM\x7fSTEM"  # no file has this in its name
 
 
 def _below(folder: str | os.PathLike[str], path: str | os.PathLike[str]) -> bool:
-    """Whether a normalized absolute path is `folder` or below it."""
+    """Return whether a normalized absolute path is `folder` or below it."""
     folder, path = os.path.normcase(folder), os.path.normcase(path)
     return path == folder or path.startswith(folder.rstrip(os.sep) + os.sep)
 
 
 def _fixed(pattern: str) -> str:
-    """The folders of a pattern before its first wildcard."""
+    """Return the folders of a pattern before its first wildcard."""
     parts = pattern.split("/")[:-1]
     first = next((k for k, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts))
     return "/".join(parts[:first]) or "."
 
 
 class _TooMany(InputError):
-    """There is no going on with the next pattern."""
+    """Too many names were searched; the remaining patterns are not tried."""
 
 
 class _Finder:
-    """Paths of patterns: *, ? and [...] in names, ** for any folders; hidden names only where a pattern's begins with a
-    dot; links to folders are not followed by **. It looks at MOST_SEEN names at most."""
+    """Finds the paths that match patterns with *, ? and [...] in names, and ** for any folders.
+
+    Hidden names match only a part that begins with a dot, and ** does not follow links to folders. At most MOST_SEEN
+    names are compared.
+    """
 
     def __init__(self) -> None:
         self.seen = 0
@@ -475,7 +519,7 @@ class _Finder:
         self._kept: dict[str, list[tuple[str, bool, bool]]] = {}
 
     def find(self, base: Path, pattern: str) -> list[str]:
-        """Sorted, each once. Raises InputError past MOST_SEEN names."""
+        """Return the sorted paths that match, without duplicates. Raises InputError for more than MOST_SEEN names."""
         parts = [part for part in re.split(r"[/\\]" if os.sep == "\\" else "/", pattern) if part]
         start = str(base)
         if os.path.isabs(pattern):
@@ -486,7 +530,7 @@ class _Finder:
         return sorted(found)
 
     def _names(self, folder: str) -> list[tuple[str, bool, bool]]:
-        """(name, is a folder, is a link) of what is in a folder; nothing where it cannot be listed."""
+        """Return (name, is a folder, is a link) of each entry of a folder; an empty list where it cannot be read."""
         if folder not in self._kept:
             self.looked[Path(folder)] = None
             try:
@@ -500,6 +544,7 @@ class _Finder:
         return self._kept[folder]
 
     def _walk(self, folder: str, parts: Sequence[str], k: int, found: dict[str, None]) -> None:
+        """Add the paths below `folder` that match the parts of a pattern from part k on."""
         part, last = parts[k], k == len(parts) - 1
         if part == "**":
             if not last:
@@ -533,7 +578,10 @@ class _Finder:
 
 
 def _recipe(options: dict[str, Any]) -> str:
-    """Options as JSON, with the digests of the files they name: what a worker keeps is then of what they hold."""
+    """Encode options as JSON, with the digests of the files that they name.
+
+    A worker caches plans by this text, so a changed file gives a new plan.
+    """
     files = [file for name in MODELS if (spec := options.get(name)) and (file := file_of(spec))]
     files += [name for name in options.get("for_", "").split(",") if name.lower().endswith(".toml")]
     if options.get("environment"):
@@ -544,7 +592,7 @@ def _recipe(options: dict[str, Any]) -> str:
 
 @lru_cache(maxsize=64)
 def _bake_plan(recipe: str, output: str, force: bool) -> baking.BakePlan:
-    """The plan of a [[bake]], of no environment yet."""
+    """Return the plan of a `[[bake]]`, with a placeholder for the environment."""
     options = json.loads(recipe)["options"]
     return baking.plan(BakeRequest(["environment"], output, force=force, **options))
 
@@ -561,7 +609,7 @@ def _table_plan(recipe: str, kind: str, output: str, force: bool) -> tables.Tabl
 
 @dataclass(frozen=True)
 class Prepared:
-    """An item that was read; `loaded` is None where a device must make it (demo, tables)."""
+    """An item after reading. `loaded` is None where the device makes everything (demo, tables)."""
 
     item: Item
     loaded: baking.Loaded | None
@@ -570,7 +618,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Computed:
-    """An item that is to be encoded and written."""
+    """An item after computing, before encoding and writing."""
 
     item: Item
     made: baking.Computed
@@ -578,12 +626,13 @@ class Computed:
 
 
 def failed(item: Item, message: str, exit_code: int = 2) -> Result:
-    """The result of an item that failed, with its reason."""
+    """Return the result of an item that failed, with the reason and the exit code."""
     return Result(item.index, item.kind, item.place, item.name, "failed", item.output, message=message,
                   exit_code=exit_code)
 
 
 def _failure(item: Item, error: Exception) -> Result:
+    """Return the result of an item that raised `error`."""
     if isinstance(error, WhitefurnaceError):
         return failed(item, str(error), error.exit_code)
     if isinstance(error, MemoryError):
@@ -594,7 +643,7 @@ def _failure(item: Item, error: Exception) -> Result:
 
 
 def prepare(item: Item) -> Prepared | Result:
-    """Reads an item and takes the lock of its output: the part that may run ahead of the device."""
+    """Read the source of an item and lock its output. This may run while the device computes an earlier item."""
     begin = time.perf_counter()
     try:
         _check_inside(item)
@@ -610,7 +659,7 @@ def prepare(item: Item) -> Prepared | Result:
 
 
 def compute(prepared: Prepared) -> Computed | Result:
-    """What the device does for an item. One thread of a process at a time."""
+    """Compute an item on the device. Only one thread of a process may call this at a time."""
     item, begin = prepared.item, time.perf_counter()
     loaded = prepared.loaded
     try:
@@ -634,7 +683,7 @@ def compute(prepared: Prepared) -> Computed | Result:
 
 
 def write(computed: Computed) -> Result:
-    """Encodes and writes an item: the part that may run behind the device."""
+    """Encode and write an item. This may run while the device computes a later item."""
     item, begin = computed.item, time.perf_counter()
     try:
         _check_inside(item)
@@ -648,14 +697,14 @@ def write(computed: Computed) -> Result:
 
 
 def abandon(found: Prepared | Computed) -> None:
-    """Lets go of an item that will not go on."""
+    """Release the lock and the memory of an item that will not be finished."""
     held = found.made if isinstance(found, Computed) else found.loaded
     if held is not None:
         baking.abandon(held)
 
 
 def do(item: Item) -> Result:
-    """One item from end to end. Raises nothing but what stops a process: a failure is a result."""
+    """Run one item from end to end. A failure is returned as a result and not raised."""
     found: Prepared | Computed | Result = prepare(item)
     if isinstance(found, Prepared):
         found = compute(found)
@@ -666,16 +715,17 @@ def do(item: Item) -> Result:
 
 
 def _one(item: Item, source: str | None = None) -> baking.BakePlan:
-    """The order of an item alone."""
+    """Return the plan of one item, reading `source` in place of the item's own where it is given."""
     return replace(_bake_plan(item.recipe, item.output, item.force), names=(item.name,),
                    sources=(source or item.source,))
 
 
 MOST_SENT = 1 << 30
+"""Largest size of a source that is sent to a cluster, in bytes."""
 
 
 def load(item: Item) -> Item:
-    """The item with its source, where that is to be sent by value. Raises FileError, InputError."""
+    """Return the item with the content of its source, where that is sent by value. Raises FileError and InputError."""
     if not item.send or item.kind == "lut" or item.source == baking.DEMO:
         return item
     files = source_files(item.source)
@@ -691,7 +741,7 @@ def load(item: Item) -> Item:
 
 @contextlib.contextmanager
 def _source(item: Item) -> Iterator[str]:
-    """Where the item's source can be read: its path, or a folder that holds what was sent."""
+    """Give the path of the item's source: its own, or one in a temporary folder with the content that was sent."""
     if item.content is None:
         yield item.source
         return
@@ -708,7 +758,7 @@ def _source(item: Item) -> Iterator[str]:
 
 
 def _check_inside(item: Item) -> None:
-    """Refuses folders that a link leads out of the root: it may have been put there since the job was checked."""
+    """Refuse output folders outside the root, links followed. A link may be newer than the check of the job."""
     folders = {Path(item.output).parent} if item.kind == "lut" else {Path(item.output), *(
         t.path.parent for t in baking.targets_of(_bake_plan(item.recipe, item.output, item.force), _STEM))}
     for folder in sorted(folders):
@@ -737,15 +787,18 @@ def _of_table(item: Item, table: tables.Table, seconds: dict[str, float]) -> Res
 
 # ---------------------------------------------------------------------------------------------- what would be done
 
-# Processor seconds of an item in a running process, and the most bytes that the process has had by then: least squares
-# over lat-longs of 32 to 1 024 rows, chains from 32² to 512² and tolerances of 1e-2 to 1e-4, with PoCL on AVX-512. They
-# are off by up to twice, of images of under a hundred rows by up to three times; memory by a tenth.
+# The cost model of an item: processor seconds in a running process, and peak bytes of that process. Fitted by least
+# squares over lat-longs of 32 to 1 024 rows, chains from 32² to 512² and tolerances of 1e-2 to 1e-4, with PoCL on
+# AVX-512. Times are within a factor of two, or of three for images of under a hundred rows; memory is within a tenth.
 SECONDS = {"item": 0.041, "texel": 1.3e-7, "pair": 1.2e-10}
 BYTES = {"process": 150e6, "texel": 90.0, "cell": 180.0}
 
 
 def predict(item: Item) -> Result:
-    """What an item would do, from its header and digests. Processor time and memory are rough (`SECONDS`, `BYTES`)."""
+    """Predict the result of an item from the header and digest of its source.
+
+    Processor time and memory are rough estimates (`SECONDS`, `BYTES`).
+    """
     try:
         _check_inside(item)
         if item.kind == "lut":
@@ -776,11 +829,12 @@ STAGES = pool.Stages(prepare, compute, write, abandon, failed, Result, load)
 
 def run(job: Job, *, workers: int = 1, scheduler: str | None = None, on_result: Callable[[Result], None],
         on_notice: Callable[[str], None] | None = None) -> None:
-    """Does every item; `on_result` hears of each in the order they end. What a killed run left in the job's folders is
-    removed at the end.
+    """Run every item of a job, and remove the files that killed runs left in its folders.
 
-    Workers of this machine use the device that this process would use; those of a cluster choose on their own machine.
-    Raises what `pool.run` does.
+    workers: number of processes on this machine. scheduler: address of a Dask scheduler to run on instead. on_result
+    is called with each result, in the order in which items end; on_notice with sentences about the run.
+    Workers of this machine use the device that this process would use; workers of a cluster choose their own.
+    Raises the errors of `pool.run`.
     """
     items: Iterable[Item] = job.items
     if scheduler is None and workers > 1:
@@ -792,9 +846,9 @@ def run(job: Job, *, workers: int = 1, scheduler: str | None = None, on_result: 
 
 
 def _on_one_device(items: Iterable[Item]) -> Iterator[Item]:
-    """The items with their device named so that any process of this machine finds the same one.
+    """Yield the items with their device named so that every process of this machine finds the same one.
 
-    Where none works the items keep what was asked for, and each that needs a device fails with the reason.
+    Where no device works the items are unchanged, and each that needs a device fails with the reason.
     """
     known: dict[str | None, str | None] = {}
     for item in items:
@@ -806,7 +860,7 @@ def _on_one_device(items: Iterable[Item]) -> Iterator[Item]:
 
 
 class Summary:
-    """Counts of results as they come, and the failures with their reasons. `begin` is when it was made."""
+    """Running totals of a batch: counts of results, sums of times and sizes, and the failures. Time starts now."""
 
     def __init__(self, total: int) -> None:
         self.total, self.begin = total, time.perf_counter()
@@ -817,6 +871,7 @@ class Summary:
         self.failed: list[Result] = []
 
     def add(self, result: Result) -> None:
+        """Add the result of an item."""
         self.states[result.state] += 1
         if result.state == "failed":
             self.failed.append(result)
@@ -829,16 +884,17 @@ class Summary:
 
     @property
     def count(self) -> int:
-        """How many have ended."""
+        """Number of items that have ended."""
         return sum(self.states.values())
 
     @property
     def wall(self) -> float:
+        """Seconds since the start."""
         return time.perf_counter() - self.begin
 
 
 def clean(job: Job) -> None:
-    """Removes what dead runs left in the folders of a job's outputs, and folders that were made and stayed empty."""
+    """Remove the files that killed runs left in the output folders of a job, and new folders that are empty."""
     folders: dict[Path, set[str]] = {}
     for item in job.items:
         folders.setdefault(Path(item.output).parent if item.kind == "lut" else Path(item.output), set()).add(item.name)
@@ -857,11 +913,15 @@ def clean(job: Job) -> None:
 
 
 def depfile(job: Job, results: Iterable[Result], path: str | os.PathLike[str]) -> None:
-    """Writes rules in Makefile syntax: the outputs of every item that is whole, and what each was made from. The latter
-    are targets too, without a recipe: that one is gone is then no error but a reason to run. Raises FileError, and
-    InputError for a name with a line break, which the syntax cannot hold."""
+    """Write a dependency file in Makefile syntax: the outputs of every item that is done or up to date, and its inputs.
+
+    Inputs are targets without a recipe too, so that a missing input is a reason to run and not an error of make.
+    Raises FileError where the file cannot be written, and InputError for a name with a line break, which the syntax
+    cannot hold.
+    """
     written = {Path(result.output).parent if result.kind == "lut" else Path(result.output) for result in results}
-    # A folder that patterns look into changes when a file comes or goes; one that is written into always does.
+    # A searched folder changes when a file is added or removed. A folder that is written to changes in every run, so it
+    # is left out.
     looked = [str(folder) for folder in job.looked if folder not in written]
     common = [str(job.path), *map(str, job.named), *looked]
     items = {item.index: item for item in job.items}
@@ -878,18 +938,20 @@ def depfile(job: Job, results: Iterable[Result], path: str | os.PathLike[str]) -
         lines.append(f"{targets}: {' '.join(map(escaped, [*common, *sources]))}\n")
     lines += [f"{escaped(one, target=True)}:\n" for one in needed]
     text = "".join(lines)
-    # A rule with = before its colon would be read as a variable's definition.
+    # make would read a rule with = before its colon as the definition of a variable.
     if "=" in text:
         text = "whitefurnace_equals := =\n" + text.replace("=", "$(whitefurnace_equals)")
     write_text(path, text)
 
 
 def escaped(name: str, *, target: bool = False) -> str:
-    """A file's name as Makefiles have it, for GNU make and Ninja: a % is a pattern in a target alone. Raises InputError
-    for a name with a line break."""
+    """Escape a file name for Makefiles of GNU make and Ninja; % is escaped in targets alone, where it is a pattern.
+
+    Raises InputError for a name with a line break.
+    """
     if "\n" in name or "\r" in name:
         raise InputError(f"{name!r} has a line break, which a Makefile cannot hold")
     special = r" \t#" + (r":*?\[\]" if os.sep == "/" else "") + ("%" if target else "")
     name = f"./{name}" if name.startswith("~") else name
-    # Backslashes before what is escaped are doubled, the others stay, as GCC writes them.
+    # Backslashes before an escaped character are doubled and others are kept, as GCC does.
     return re.sub(rf"(\\*)([{special}])", r"\1\1\\\2", name).replace("$", "$$")
