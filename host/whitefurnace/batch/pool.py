@@ -1,7 +1,7 @@
-"""Three stages over many items: in this process, in worker processes of this machine, or on a Dask cluster.
+"""Runs many items through three stages, in this process, in worker processes of this machine, or on a Dask cluster.
 
-It knows nothing of what the stages do. Within a process they overlap: while one item is computed the next are read and
-the last is written. An item that fails, or kills its process, takes no other with it.
+The caller supplies the stages. Within a process they overlap: while one item is computed, the next ones are read and
+the last one is written. An item that fails, or kills its process, does not affect the others.
 """
 from __future__ import annotations
 
@@ -30,29 +30,33 @@ from whitefurnace.version import VERSION
 
 MOST_WORKERS = 1024
 RESOURCE = "OPENCL"
-# Of a worker's OPENCL=1: four items at a time, one in each stage and one waiting, fill its pipeline. A binary
-# fraction, so that four are exactly one.
+# Share of a worker's OPENCL=1 that an item takes: four items, one in each stage and one waiting, fill its pipeline.
+# It is a binary fraction, so that four add up to exactly one.
 SHARE = 0.25
-# Items a Dask worker has or is about to get: with two more than it works on it never waits for the network, and
-# after Ctrl-C little is left to finish.
+# Number of items submitted for each Dask worker: two more than it works on, so that it never waits for the network.
+# More would only have to be finished after Ctrl-C.
 WINDOW = 6
-# The first worker builds the kernels alone; where it builds none (all items were there already) or hangs, the others
-# join it after this many results or seconds.
+# The first worker builds the kernels alone. The others start after this many results or seconds where it builds none,
+# because all items were up to date, or hangs.
 FIRST = 8
 FIRST_SECONDS = 30.0
-CONNECT_SECONDS = 10  # for a scheduler to answer
-TICK = 0.1  # seconds between two looks at what sends no message: Ctrl-C, a lost scheduler
+CONNECT_SECONDS = 10  # time for a scheduler to answer
+TICK = 0.1  # seconds between two checks for events that send no message: Ctrl-C, a lost scheduler
 PATIENCE = 3.0  # seconds that a stage may take to end after the second Ctrl-C, before its process is killed
 
 
 @dataclass(frozen=True)
 class Stages:
-    """What is done to an item: functions of modules, so that they can be sent to other processes by their names.
+    """The functions that run an item. They are functions of modules, so that other processes find them by name.
 
-    `prepare(item)` reads, `compute(prepared)` is the only one on the device and runs in one thread, `write(computed)`
-    stores; any of the three may return a `result` instead, which ends that item. `abandon(prepared or computed)` undoes
-    what will not go on; `failed(item, message, exit_code)` makes the result of what the pool itself finds. `load(item)`
-    gives the item as it is sent to a cluster. Items and results are small and can be pickled.
+    prepare  prepare(item) reads its input
+    compute  compute(prepared) is the only stage that uses the device, and runs in one thread
+    write    write(computed) stores its output and returns its result
+    abandon  abandon(prepared or computed) releases an item that will not be finished
+    failed   failed(item, message, exit_code) returns the result of a failure that the pool detects
+    result   the type of results; prepare and compute may return one too, which ends the item
+    load     load(item) returns the item as it is sent to a cluster
+    Items and results must be small and picklable.
     """
 
     prepare: Callable[[Any], Any]
@@ -67,14 +71,16 @@ class Stages:
 def run(stages: Stages, items: Iterable[Any], *, workers: int = 1, scheduler: str | None = None,
         on_result: Callable[[Any], None], on_notice: Callable[[str], None] | None = None,
         stop: threading.Event | None = None) -> None:
-    """Takes every item through the stages; `on_result` gets each result, in order of completion, in this thread.
+    """Run every item through the stages.
 
-    With one worker in this process; with more in as many processes, each with its share of the cores; with
-    `scheduler` on the workers of a Dask cluster that declare the resource OPENCL. `items` is taken from as there is
-    room, so it may be endless. Ctrl-C, or `stop`, finishes what is in flight; a second Ctrl-C abandons that too.
-    Raises KeyboardInterrupt after either; UsageError for impossible arguments; UnsupportedError without Dask or with
-    another version of this package on a worker; FileError where no scheduler answers or it is lost; DeviceError where
-    worker processes cannot start; what `items` raises, after what was in flight.
+    items: taken one by one as there is room, so it may be endless. workers: 1 runs in this process, more in as many
+    processes with equal shares of the cores. scheduler: address of a Dask scheduler, whose workers with the resource
+    OPENCL run the items. on_result is called with each result, in order of completion, in this thread; on_notice with
+    sentences about the run. stop: an event that ends the run as Ctrl-C does.
+    The first Ctrl-C finishes the items in flight, a second one abandons them; both raise KeyboardInterrupt at the end.
+    Raises UsageError for invalid arguments, UnsupportedError without Dask or with another version of this package on a
+    worker, FileError where no scheduler answers or it is lost, and DeviceError where worker processes cannot start.
+    An exception of `items` is raised after the items in flight have ended.
     """
     if not 1 <= workers <= MOST_WORKERS:
         raise UsageError(f"{workers} workers: give 1 to {MOST_WORKERS}")
@@ -93,7 +99,7 @@ def run(stages: Stages, items: Iterable[Any], *, workers: int = 1, scheduler: st
 
 
 class _Interrupts:
-    """Ctrl-C while it lasts: the first sets `stop`, the second raises KeyboardInterrupt in the main thread."""
+    """Handles Ctrl-C within a `with` block: the first sets `stop`, the second raises KeyboardInterrupt."""
 
     def __init__(self, stop: threading.Event, report: Callable[[str], None]) -> None:
         self.stop = stop
@@ -119,7 +125,7 @@ class _Interrupts:
             raise KeyboardInterrupt
 
     def look(self) -> bool:
-        """Whether to begin nothing new; says so once, outside of the signal's handler."""
+        """Return whether no new item may begin, and report it once. The signal handler itself must not report."""
         if self.count and not self._reported:
             self._reported = True
             self._report("finishing what is in flight; Ctrl-C again stops it")
@@ -128,12 +134,15 @@ class _Interrupts:
     @staticmethod
     @contextlib.contextmanager
     def held() -> Iterator[None]:
-        """Keeps Ctrl-C, which reaches all processes of a terminal, from one that starts meanwhile until it can ignore
-        it: a blocked signal is inherited, and is not lost to us."""
+        """Block Ctrl-C while a process starts, until the process can ignore it.
+
+        Ctrl-C reaches all processes of a terminal. A new process inherits the block, and this process gets a blocked
+        signal later.
+        """
         if not hasattr(signal, "pthread_sigmask"):
             yield
             return
-        resource_tracker.ensure_running()  # when multiprocessing starts it, it lets the signal through again
+        resource_tracker.ensure_running()  # started by multiprocessing later, it would unblock the signal
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
         try:
             yield
@@ -142,12 +151,13 @@ class _Interrupts:
 
 
 def _message(error: BaseException) -> str:
-    """One line that tells an exception; its class too, unless it is ours and reads as a sentence."""
+    """Describe an exception in one line, with its class unless it is an error of this package with a sentence."""
     text = " ".join(str(error).split())
     return text if isinstance(error, WhitefurnaceError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
 
 
 def _code(error: BaseException) -> int:
+    """Return the exit code for an exception."""
     return error.exit_code if isinstance(error, WhitefurnaceError) else FileError.exit_code
 
 
@@ -157,9 +167,9 @@ def _code(error: BaseException) -> int:
 class Pipeline:
     """Reads, computes and writes consecutive items at the same time, in three threads.
 
-    At most two items are read ahead (one of them still being read) and two wait behind (one being written).
-    `source()` gives the next `(ticket, item)` or None at the end and `emit(ticket, item, result)` takes what became of
-    it, in any of the three threads.
+    At most two items are read ahead (one of them still being read), and two follow (one being written).
+    source: returns the next (ticket, item), or None at the end. emit: called with (ticket, item, result) when an item
+    ends, in any of the three threads.
     """
 
     def __init__(self, stages: Stages, source: Callable[[], tuple[int, Any] | None],
@@ -169,15 +179,16 @@ class Pipeline:
         self._emit = emit
         self._ahead: queue.Queue[tuple[int, Any] | None] = queue.Queue(1)
         self._behind: queue.Queue[tuple[int, Any] | None] = queue.Queue(1)
-        self._held: dict[int, Any] = {}  # by ticket, what a stage gave and the next has not taken
+        self._held: dict[int, Any] = {}  # by ticket, the output of a stage until the next stage takes it
         self._lock = threading.Lock()
         self._closed = threading.Event()
         self._failure: BaseException | None = None
 
     def run(self, idle: Callable[[], None] = lambda: None) -> None:
-        """Computes in the calling thread until the source ends; calls `idle` between items and every 0.1 s.
+        """Compute in the calling thread until the source ends; call `idle` between items and every 0.1 s.
 
-        Raises what the source or `emit` raised, after all items; if this thread is interrupted it abandons them all.
+        An exception of the source or of `emit` is raised after all items. If this thread is interrupted, all items are
+        abandoned.
         """
         reader = threading.Thread(target=self._read, name="read", daemon=True)
         writer = threading.Thread(target=self._write, name="write", daemon=True)
@@ -217,10 +228,10 @@ class Pipeline:
             raise self._failure
 
     def _stage(self, stage: Callable[[Any], Any], value: Any, ticket: int, item: Any) -> bool:
-        """Runs a stage of an item and holds what it gave; whether that ends the item."""
+        """Run a stage of an item and hold its output; return whether the item has ended."""
         try:
             given = stage(value)
-        except Exception as error:  # the item's own: the others go on
+        except Exception as error:  # it fails this item alone
             if stage is not self._stages.prepare:
                 self._undo(value)
             given = self._stages.failed(item, _message(error), _code(error))
@@ -236,6 +247,7 @@ class Pipeline:
         return True
 
     def _read(self) -> None:
+        """Take items from the source and prepare them: the reading thread."""
         try:
             while not self._closed.is_set() and (job := self._source()) is not None:
                 if self._stage(self._stages.prepare, job[1], *job):
@@ -252,6 +264,7 @@ class Pipeline:
                 return
 
     def _write(self) -> None:
+        """Write computed items: the writing thread."""
         while not self._closed.is_set():
             try:
                 job = self._behind.get(timeout=TICK)
@@ -265,7 +278,7 @@ class Pipeline:
                 value = self._held.pop(job[0])
             try:
                 self._stage(self._stages.write, value, *job)
-            except BaseException as error:  # of emit
+            except BaseException as error:  # raised by emit
                 self._failure = error
 
     def _undo(self, value: Any) -> None:
@@ -273,7 +286,7 @@ class Pipeline:
             self._stages.abandon(value)
 
     def _close(self, writer: threading.Thread) -> None:
-        """Lets what is being written end, and abandons the rest."""
+        """Let the item that is being written end, and abandon the others."""
         with self._lock:
             self._closed.set()
             held, self._held = list(self._held.values()), {}
@@ -283,7 +296,7 @@ class Pipeline:
 
 
 def _here(stages: Stages, items: Iterable[Any], on_result: Callable[[Any], None], interrupts: _Interrupts) -> None:
-    """One pipeline in this process; it computes in this thread, where Ctrl-C is heard."""
+    """Run all items in one pipeline of this process. It computes in this thread, which receives Ctrl-C."""
     source = enumerate(items)
     results: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
@@ -305,16 +318,16 @@ def _here(stages: Stages, items: Iterable[Any], on_result: Callable[[Any], None]
 
 
 def _serve(stages: Stages, connection: Connection) -> None:
-    """A worker process: asks for an item whenever it can read one, until the other end closes or SIGTERM comes."""
+    """Run a worker process: request an item whenever one can be read, until the connection closes or SIGTERM comes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # blocked when it started
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # it was blocked while this process started
     signal.signal(signal.SIGTERM, lambda number, frame: _leave())
     sending = threading.Lock()
     warm = False
 
     def send(kind: str, ticket: int, value: bytes | str) -> None:
-        with sending, contextlib.suppress(OSError):  # nobody listens any more: the end of the source comes next
+        with sending, contextlib.suppress(OSError):  # the connection is closed, which also ends the source
             connection.send_bytes(pickle.dumps((kind, ticket, value)))
 
     def source() -> tuple[int, Any] | None:
@@ -350,7 +363,7 @@ def _serve(stages: Stages, connection: Connection) -> None:
 
 @dataclass(frozen=True)
 class _Marked:
-    """Stages that tell when the first computation, with its kernels to build, is over."""
+    """Stages that set an event when the first computation has ended, which includes the build of the kernels."""
 
     inner: Stages
     computed: threading.Event
@@ -367,11 +380,12 @@ class _Marked:
 
 
 def _leave() -> None:
+    """End a worker process after SIGTERM."""
     raise SystemExit(128 + signal.SIGTERM)
 
 
 class _Worker:
-    """A worker process and what it has in hand."""
+    """A worker process and the items that it has."""
 
     def __init__(self, number: int, process: Any, connection: Connection) -> None:
         self.number = number
@@ -380,7 +394,7 @@ class _Worker:
         self.items: dict[int, Any] = {}
         self.wants = False
         self.heard = False
-        self.alone = False  # it has an item that an earlier worker died of, and gets no other
+        self.alone = False  # its item was with a worker that died, so it gets no other
 
 
 class _Crew:
@@ -396,7 +410,7 @@ class _Crew:
         self.interrupts = interrupts
         self.workers: list[_Worker] = []
         self.again: deque[tuple[int, Any]] = deque()  # items whose worker died
-        self.ended = False  # the source
+        self.ended = False  # whether the source has ended
         self.failure: BaseException | None = None
         self.warm = False
         self.results = 0
@@ -422,9 +436,9 @@ class _Crew:
             raise self.failure
 
     def _start(self, number: int) -> _Worker:
-        context = multiprocessing.get_context("spawn")  # a fork of a process with OpenCL in it hangs
+        context = multiprocessing.get_context("spawn")  # the fork of a process that has loaded OpenCL hangs
         ours, theirs = context.Pipe()
-        # The first few have a core more where they do not divide evenly.
+        # Where the cores do not divide evenly, the first few workers get one more.
         share = max(cores() // self.count + (number < cores() % self.count), 1)
         process = context.Process(target=_serve, args=(self.stages, theirs), name=f"whitefurnace worker {number}",
                                   daemon=True)
@@ -438,15 +452,15 @@ class _Crew:
             return None
         try:
             job = next(self.source, None)
-        except Exception as error:  # told when what is in flight is done
+        except Exception as error:  # raised after the items in flight
             job, self.failure = None, error
         self.ended = job is None
         return job
 
     def _hand_out(self) -> None:
-        """Gives each worker that can read one an item: new ones first, then those that cost a worker its life."""
+        """Give an item to each worker that can read one: new items first, then those whose worker died."""
         for worker in self.workers:
-            # One goes first: the kernels that it builds are in the compiler's cache for the others.
+            # The first worker starts alone: the kernels that it builds are then in the compiler's cache for the others.
             self.warm = self.warm or time.monotonic() - self.began > FIRST_SECONDS
             if not worker.wants or worker.alone or (worker.number and not self.warm):
                 continue
@@ -464,7 +478,7 @@ class _Crew:
                 continue
             worker.items[ticket] = item
             worker.wants = False
-            with contextlib.suppress(OSError):  # it died: its sentinel says so
+            with contextlib.suppress(OSError):  # the worker died, and its sentinel reports it
                 worker.connection.send_bytes(blob)
 
     def _result(self, result: Any) -> None:
@@ -473,7 +487,7 @@ class _Crew:
         self.on_result(result)
 
     def _listen(self) -> None:
-        """Waits a moment for messages and deaths."""
+        """Wait a moment for messages and deaths of workers, and handle them."""
         ready = wait([thing for worker in self.workers for thing in (worker.connection, worker.process.sentinel)], TICK)
         for place, worker in enumerate(self.workers):
             dead = worker.process.sentinel in ready
@@ -501,7 +515,7 @@ class _Crew:
                     self._result(result)
 
     def _bury(self, worker: _Worker) -> _Worker:
-        """Another worker in its place. Its items, all of them suspects, are tried once more, each alone."""
+        """Start a worker in place of a dead one. Each of its items may be the cause, and is tried once more, alone."""
         worker.process.join()
         code = worker.process.exitcode or 0
         cause = f"was killed (signal {-code})" if code < 0 else f"ended (exit code {code})"
@@ -522,12 +536,12 @@ class _Crew:
         return self._start(worker.number)
 
     def _end(self, at_once: bool) -> None:
-        """Lets the workers go: they end when their pipe closes; at once by SIGTERM, then by force."""
+        """End the workers: by closing their pipes, with `at_once` by SIGTERM too, and by force after a time."""
         for worker in self.workers:
             worker.connection.close()
             if at_once:
                 worker.process.terminate()
-        # A worker may still hold a thread in a driver's call.
+        # A thread of a worker may still be inside a call of the driver.
         deadline = time.monotonic() + 2 * PATIENCE
         for worker in self.workers:
             worker.process.join(max(deadline - time.monotonic(), 0))
@@ -541,7 +555,7 @@ _environment_lock = threading.Lock()
 
 @contextlib.contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Variables that a process started meanwhile inherits."""
+    """Set environment variables for processes that start within the `with` block."""
     with _environment_lock:
         before = {name: os.environ.get(name) for name in values}
         os.environ.update(values)
@@ -559,7 +573,7 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 class _Service:
-    """The pipeline of a Dask worker, which its task threads share; its own thread computes."""
+    """The pipeline of a Dask worker. Its task threads share it, and it computes in a thread of its own."""
 
     def __init__(self, stages: Stages) -> None:
         self._jobs: queue.SimpleQueue[tuple[int, Any]] = queue.SimpleQueue()
@@ -584,6 +598,7 @@ class _Service:
         self._waiting.pop(ticket).set_result(result)
 
     def do(self, item: Any) -> Any:
+        """Run an item and return its result."""
         ticket, future = next(self._tickets), Future[Any]()
         self._waiting[ticket] = future
         self._jobs.put((ticket, item))
@@ -595,7 +610,7 @@ _services_lock = threading.Lock()
 
 
 def _do(stages: Stages, item: Any, version: str) -> Any:
-    """The task of an item, on a Dask worker."""
+    """Run an item on a Dask worker, as the task that `_Call` unpickles to."""
     if version != VERSION:
         return stages.failed(item, f"its worker has whitefurnace {VERSION}, the batch {version}",
                              UnsupportedError.exit_code)
@@ -613,7 +628,10 @@ def _do(stages: Stages, item: Any, version: str) -> Any:
 
 @dataclass(frozen=True)
 class _Call:
-    """Is done where it is unpickled: a scheduler unpickles tasks too, and need not have this package installed."""
+    """A call that runs when it is unpickled.
+
+    It is sent as bytes to `pickle.loads`, because a scheduler unpickles tasks too and need not have this package.
+    """
 
     stages: Stages
     item: Any
@@ -622,9 +640,12 @@ class _Call:
         return _do, (self.stages, self.item, VERSION)
 
 
-def _settle(beside: Mapping[str, int], dask_worker: Any) -> str:
-    """Divides a machine's cores among its workers, before OpenCL is loaded there; the version of this package."""
-    count = beside.get(dask_worker.address, 1)
+def _settle(neighbours: Mapping[str, int], dask_worker: Any) -> str:
+    """Limit a Dask worker to its share of the cores, before it loads OpenCL; return the version of this package there.
+
+    neighbours: number of workers on the machine of each worker, by its address.
+    """
+    count = neighbours.get(dask_worker.address, 1)
     if count > 1:
         os.environ.update(core_limit(max(cores() // count, 1)))
     return VERSION
@@ -639,7 +660,7 @@ def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: C
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
     levels = [logger.level for logger in loggers]
     for logger in loggers:
-        logger.setLevel(logging.CRITICAL)  # what it would print of a lost scheduler we tell in a sentence
+        logger.setLevel(logging.CRITICAL)  # a lost scheduler is reported by one sentence of ours
     try:
         try:
             client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
@@ -663,7 +684,7 @@ def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: C
 
 
 class _Cluster:
-    """A run on a Dask cluster; at no time are more than WINDOW items a worker submitted."""
+    """A run on a Dask cluster. At most WINDOW items for each worker are submitted at a time."""
 
     def __init__(self, stages: Stages, items: Iterable[Any], address: str, client: Any,
                  on_result: Callable[[Any], None], report: Callable[[str], None], interrupts: _Interrupts) -> None:
@@ -704,12 +725,13 @@ class _Cluster:
             raise failure
 
     def _gone(self) -> FileError:
+        """Return the error for a lost scheduler."""
         done = "1 item was" if self.done == 1 else f"{self.done} items were"
         return FileError(f"the scheduler at {self.address} is gone: {done} done before; run it again to go on with the "
                          f"rest")
 
     def _look(self) -> None:
-        """Every few seconds: which workers there are, new ones told of their cores."""
+        """Every two seconds, look which workers there are, and limit new ones to their share of the cores."""
         now = time.monotonic()
         if now - self.looked < 2:
             return
@@ -758,7 +780,7 @@ class _Cluster:
         self.on_result(result)
 
     def _land(self) -> None:
-        """Waits a moment for results and takes all that are there."""
+        """Wait a moment for results, and handle all that have arrived."""
         landed = []
         with contextlib.suppress(queue.Empty):
             landed.append(self.landed.get(timeout=TICK))
@@ -784,7 +806,7 @@ class _Cluster:
 
 
 def _why(future: Any) -> str:
-    """One line why a task has no result."""
+    """Return the reason why a task has no result, in one line."""
     try:
         error = future.exception(timeout=PATIENCE)
     except Exception as unreadable:
