@@ -1,6 +1,7 @@
 """Fixtures for all tests: every OpenCL device that works, and the environments the machine offers."""
 from __future__ import annotations
 
+import collections
 import functools
 import os
 import re
@@ -27,9 +28,9 @@ KERNEL_TESTS = {"catalogue", "integrals", "opencl", "prefiltering"}
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks as long those members of parametrized tests that prove little more than the others of their test.
 
-    A member that shows no new value of any parameter is one: of 9 NDFs × 7 maskings the fast suite takes some 15, with
-    each NDF and each masking in at least one of them. A test marked `few(n)` keeps n members, evenly drawn; one marked
-    `whole` keeps all. A second device runs one member of each test of kernels.
+    The fast suite keeps as few members as show each value of each parameter: of 9 NDFs × 7 maskings it takes 9. A test
+    marked `few(n)` keeps n members, evenly drawn; one marked `whole` keeps all. A second device runs one member of each
+    test of kernels.
     """
     tests: dict[str, list[pytest.Function]] = {}
     for item in items:
@@ -38,7 +39,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     first = next(iter(working_devices()), None)
     for members in tests.values():
         here = [item for item in members if item.callspec.params.get("device", first) == first]
-        kept = _kept(here)
+        kept = _kept([item for item in here if not item.get_closest_marker("long")])
         if members[0].path.parent.name in KERNEL_TESTS:
             others = [item for item in members if item not in here]
             kept += list({item.callspec.params["device"]: item for item in reversed(others)}.values())
@@ -54,12 +55,14 @@ def _kept(members: list[pytest.Function]) -> list[pytest.Function]:
     if few := members[0].get_closest_marker("few"):
         count = min(few.args[0], len(members))
         return [members[k * len(members) // count] for k in range(count)]
-    kept, seen = [], set()
-    for item in members:
-        shown = {(name, repr(value)) for name, value in item.callspec.params.items()}
-        if not shown <= seen:
-            kept.append(item)
-            seen |= shown
+    # Each value in at least one member, with as few members as that takes, and each about as often as the others.
+    values = {item: {(name, repr(value)) for name, value in item.callspec.params.items()} for item in members}
+    shown: collections.Counter[tuple[str, str]] = collections.Counter()
+    kept: list[pytest.Function] = []
+    while new := {item: n for item in members if (n := sum(not shown[v] for v in values[item]))}:
+        best = max(new, key=lambda item: (new[item], -sum(shown[v] for v in values[item])))
+        kept.append(best)
+        shown.update(values[best])
     return kept
 
 

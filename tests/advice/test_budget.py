@@ -227,7 +227,13 @@ def test_the_picture_is_that_of_the_files(name, device, tmp_path):
     # another seed of the certificate may refine a level: 1e-3 is its tolerance
     assert made.whole.rms == pytest.approx(float(np.sqrt((off * off).mean())), rel=2e-3, abs=1e-5)
     assert made.whole.p95 == pytest.approx(float(np.quantile(off, 0.95)), rel=2e-3, abs=1e-5)
-    choice = choose(meter, 0.5, usual(engine))
+
+
+@pytest.mark.long  # of Filament: test_the_choice_is_within_and_no_dearer_when_looser
+@pytest.mark.parametrize("name", ["filament", "three", "bevy", "raw", "babylon"])
+def test_any_engine_has_a_choice(name, device, tmp_path):
+    scene = scene_of(tmp_path, *MIXED, plain((0.1, 0.1, 0.1), 0, 0.2, ior={"ior": 2.0}))
+    choice = choose(ErrorMeter(scene, lobed(), ENGINES[name], device, count=COUNT), 0.5, usual(ENGINES[name]))
     assert choice.met and choice.nbytes < choice.usual_nbytes
 
 
@@ -339,7 +345,7 @@ def code(*arguments: str) -> int:
 
 
 def test_the_command_tells_and_bakes(device, tmp_path, capsys):
-    scene_of(tmp_path, *MIXED)
+    scene_of(tmp_path, MIXED[2])
     env = lobed()
     write_exr(tmp_path / "sky.exr", env.texels)
     arguments = ["scene", str(tmp_path / "scene.gltf"), "--for", "filament", "--environment", str(tmp_path / "sky.exr")]

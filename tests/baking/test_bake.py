@@ -243,7 +243,7 @@ def test_what_is_kept_between_images_is_the_right_one(tmp_path):
     name. Each bake has the table of its own NDF, and what was baked before is not taken for it."""
     lobe, picture = tmp_path / "mine.clh", noise(height=4)
     sizes, tables, keys = dict(size=8, min_size=8), [], []
-    for k, ndf in enumerate(["ggx", "beckmann", "abc:c=2", "abc:c=3", lobe, lobe, "ggx"]):
+    for k, ndf in enumerate(["ggx", "abc:c=2", "abc:c=3", lobe, lobe, "ggx"]):
         if ndf is lobe:
             lobe.write_text(f"real ndf_mine_D(real cos_m, real alpha) {{ return {k + 1}.0f * cos_m + alpha; }}\n")
         (baked,) = bake(picture, tmp_path / str(k), ndf=ndf, **sizes)
@@ -405,8 +405,9 @@ def test_a_model_from_a_file(tmp_path, shell):
     assert shell("bake", source, "-o", tmp_path / "mine", *SMALL, "--ndf", f"{lobe}:scale=3") == 0
     assert "up to date" in shell.out
     lobe.write_text(MY_GGX.replace("sqr(alpha / t)", "alpha / t"))
-    assert shell("bake", source, "-o", tmp_path / "mine", *SMALL, "--ndf", f"{lobe}:scale=3") == 0, shell.err
-    assert verified(tmp_path / "mine")["key"] != key
+    again = ("bake", source, "-o", tmp_path / "mine", *SMALL, "--ndf", f"{lobe}:scale=3", "--dry-run", "--json")
+    assert shell(*again) == 0, shell.err
+    assert shell.rows()[-1]["key"] != key
 
 
 @pytest.mark.parametrize("text, options, code, words", [
