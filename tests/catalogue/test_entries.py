@@ -70,33 +70,38 @@ def test_a_stated_error_is_the_one_that_readers_see(entry: Model) -> None:
         assert f"at most {stated:g}".replace("e-0", "e-") in str(entry.notes["float32"])
 
 
-KERNEL = """// A lobe that nobody has published. [Nobody2030]
+KERNEL = """// A lobe that nobody has published, between a uniform one and a squared cosine. [Nobody2030]
 
-// D = 2 cos²θ/π, whose integral ∫ D cos θ dω = 4 ∫ c³ dc is 1.
-static inline real ndf_quadratic_D(real cos_m, real sin2_m) { return 2 / PI * sqr(cos_m); }
+// ∫ cos θ dω/π is 1, and so is ∫ 2 cos³θ dω/π.
+static inline real ndf_bowl_D(real cos_m, real sin2_m, real k) { return (1 - k + 2 * k * sqr(cos_m)) / PI; }
 
 // It has no peak to grade nodes for.
-static inline real ndf_quadratic_width(void) { return (real)HALF_PI; }
+static inline real ndf_bowl_width(real k) { return (real)HALF_PI; }
 """
-ENTRY = '''"""A squared cosine."""
+ENTRY = '''"""A lobe between a uniform one and a squared cosine."""
 import numpy as np
 
-from whitefurnace.catalogue.model import Checks, Model, Paper
+from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
+from whitefurnace.catalogue.roughness import alpha_of_roughness
+
+K = Parameter("k", "k", "1", 0.0, 1.0, (0.0, 0.3, 1.0), "share of the squared cosine")
 
 
-def _d(theta_m):
-    """2/(π (1 + tan²θ))."""
-    return np.where(np.cos(theta_m) > 0, 2 / (np.pi * (1 + np.tan(np.asarray(theta_m, np.float64)) ** 2)), 0.0)
+def _d(theta_m, k):
+    """cos² as 1/(1 + tan²)."""
+    theta_m = np.asarray(theta_m, np.float64)
+    return np.where(np.cos(theta_m) > 0, (1 - k) / np.pi + 2 * k / (np.pi * (1 + np.tan(theta_m) ** 2)), 0.0)
 
 
 ENTRY = Model(
     slot="ndf",
-    name="quadratic",
-    title="Squared cosine",
+    name="bowl",
+    title="Bowl",
     citation=Paper("Nobody2030", "N. Nobody, A Lobe of No Use, 2030"),
-    parameters=(),
+    parameters=(K,),
     provides=("NDF_D", "NDF_WIDTH"),
     reference={"D": _d},
+    from_roughness=lambda r: {"k": 1 - alpha_of_roughness(r)},
     checks=Checks(normalized=True),
 )
 '''
@@ -108,8 +113,8 @@ def test_a_new_model_is_its_kernel_and_its_entry(device: Device, tmp_path: Path)
     ignored = shutil.ignore_patterns("__pycache__")
     shutil.copytree(HOST, package, ignore=ignored)
     shutil.copytree(KERNELS, package / "kernels", ignore=ignored, dirs_exist_ok=True)
-    (package / "kernels" / "ndf" / "quadratic.clh").write_text(KERNEL, "utf-8")
-    (package / "catalogue" / "ndf" / "quadratic.py").write_text(ENTRY, "utf-8")
+    (package / "kernels" / "ndf" / "bowl.clh").write_text(KERNEL, "utf-8")
+    (package / "catalogue" / "ndf" / "bowl.py").write_text(ENTRY, "utf-8")
 
     def run(*words: str) -> str:
         done = subprocess.run([sys.executable, "-m", "whitefurnace", *words], cwd=tmp_path, capture_output=True,
@@ -119,9 +124,9 @@ def test_a_new_model_is_its_kernel_and_its_entry(device: Device, tmp_path: Path)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    assert "Squared cosine" in run("models") and "Nobody2030" in run("models")
-    assert "N. Nobody, A Lobe of No Use, 2030" in run("models", "quadratic")
-    told = run("verify", "quadratic", "--precision", "32")
+    assert "Bowl" in run("models") and "Nobody2030" in run("models")
+    assert "N. Nobody, A Lobe of No Use, 2030" in run("models", "bowl")
+    told = run("verify", "bowl", "--precision", "32")
     assert "normalization" in told and "weak furnace, smith" in told and "sampler, chi²" in told
     listed = "from whitefurnace.catalogue.bibliography import bibliography; print(*bibliography())"
     found = subprocess.run([sys.executable, "-c", listed], cwd=tmp_path, capture_output=True, text=True,

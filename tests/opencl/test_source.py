@@ -34,7 +34,7 @@ def test_models_have_the_functions_that_they_provide(entry: Model) -> None:
         if entry.slot in SELF_CONTAINED:
             wanted = [*("real3" if kind is VECTOR else "real" for kind in kinds),
                       *("real" for _ in entry.passed(function))]
-            assert [words[0] for words in taken] == wanted, f"{name}({found[1]})"
+            assert [words[0] for words in taken if words != ["void"]] == wanted, f"{name}({found[1]})"
 
 
 def test_every_program_is_made_of_files_that_exist() -> None:
