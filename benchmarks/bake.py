@@ -1,5 +1,7 @@
-"""What a default bake costs and how exact it is: CPU time and memory of a whole process on a warm kernel cache,
-and the stated errors, for the demo and every environment in the folder WHITEFURNACE_ENVIRONMENTS names.
+"""Measures the cost and the stated errors of a default bake.
+
+The cost is the CPU time and the memory of a whole process on a warm kernel cache. The sources are the demo and every
+environment in the folder that WHITEFURNACE_ENVIRONMENTS names.
 
     python benchmarks/bake.py [-n RUNS] [--markdown]
 """
@@ -15,26 +17,27 @@ import tempfile
 import time
 from pathlib import Path
 
-# As `python -m whitefurnace`, but in a process that reports its own CPU time and peak memory at its end.
+# Runs the command line as `python -m whitefurnace` does, and prints the process's CPU time and peak memory at its end.
 RUN = """
 import atexit, resource, sys
-def tell():
+def report():
     used = resource.getrusage(resource.RUSAGE_SELF)
     print("usage", used.ru_utime + used.ru_stime, used.ru_maxrss, file=sys.stderr)
-atexit.register(tell)
+atexit.register(report)
 from whitefurnace.cli import main
 main(sys.argv[1:])
 """
 
 
 def environments() -> list[str]:
+    """Return the sources of the bakes: `demo` and the paths of environments."""
     folder = os.environ.get("WHITEFURNACE_ENVIRONMENTS")
     found = [p for p in sorted(Path(folder).iterdir()) if p.suffix in (".exr", ".hdr")] if folder else []
     return ["demo", *map(str, found)]
 
 
 def bake(environment: str, output: str) -> tuple[float, float, float, list[dict]]:
-    """Wall seconds, CPU seconds, MB at the peak, and the JSON rows of one bake."""
+    """Run one bake; return wall seconds, CPU seconds, peak memory in MB, and its JSON rows."""
     begin = time.perf_counter()
     done = subprocess.run([sys.executable, "-c", RUN, "bake", environment, "-o", output, "--force", "--json"],
                           capture_output=True, text=True, check=True)
@@ -53,7 +56,7 @@ def main() -> None:
     device = {}
     with tempfile.TemporaryDirectory() as output:
         for environment in environments():
-            bake(environment, output)  # builds kernels where the cache is cold
+            bake(environment, output)  # builds the kernels if they are not in the cache
             runs = [bake(environment, output) for _ in range(options.runs)]
             levels = [row for row in runs[0][3] if row["event"] == "level"]
             whole = runs[0][3][-1]

@@ -1,5 +1,7 @@
-"""What a batch of probes costs: cubes as EXR in, raw out. Wall and CPU time of a whole process by number of items and
-of workers, how far its stages overlap, and the cost model (fixed, per item, per byte) with what it predicts.
+"""Measures the cost of a batch of probes, which reads cubes as EXR and writes raw files.
+
+Prints the wall and CPU time of a whole process by number of items and of workers, the overlap of its stages, and a
+cost model (fixed, per item, per byte) with a prediction.
 
     python benchmarks/batch.py [--items N ...] [--sizes S ...] [--workers N ...] [--tolerance X] [--predict N]
 """
@@ -18,11 +20,11 @@ import numpy as np
 
 from whitefurnace.files import write_exr
 
-# A batch in a process that tells its own use of the machine, and its workers', at its end.
+# Runs a batch, and prints the CPU time and the memory of the process and its workers at its end.
 RUN = """
 import json, resource, sys
-from whitefurnace import batch
-from whitefurnace.device import choose_device
+from whitefurnace.batch import jobs
+from whitefurnace.opencl.device import choose_device
 total = dict(read=0.0, compute=0.0, write=0.0, nbytes=0, done=0, bad=0)
 def on_result(result):
     total["nbytes"] += result.nbytes
@@ -32,7 +34,7 @@ def on_result(result):
         total[name] += seconds
 if __name__ == "__main__":
     workers = int(sys.argv[2])
-    batch.run(batch.job(sys.argv[1], force=True), workers=workers, on_result=on_result)
+    jobs.run(jobs.job(sys.argv[1], force=True), workers=workers, on_result=on_result)
     total["kernels"] = choose_device().seconds if workers == 1 else None
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     total["cpu"] = sum(u.ru_utime + u.ru_stime for u in used)
@@ -42,7 +44,7 @@ if __name__ == "__main__":
 
 
 def probes(folder: Path, count: int, size: int) -> int:
-    """`count` environments of six `size`² faces, sky, ground and a bright patch with some grain; bytes of one."""
+    """Write `count` environments of six `size`² faces: sky, ground and a bright patch, with noise; return bytes of one."""
     random = np.random.default_rng(size)
     row = np.linspace(1, 0, 6 * size, dtype=np.float32)[:, None, None]
     for k in range(count):
@@ -54,33 +56,33 @@ def probes(folder: Path, count: int, size: int) -> int:
 
 
 def run(folder: Path, count: int, options: argparse.Namespace, workers: int) -> dict[str, float]:
-    """Bakes the first `count` probes; seconds and bytes."""
+    """Bake the first `count` probes; return seconds and bytes by name."""
     names = ", ".join(f'"probe{k:05d}.exr"' for k in range(count))
     (folder / "job.toml").write_text(f'[[bake]]\nenvironments = [{names}]\noutput = "out"\nsize = {options.size}\n'
                                      f'tolerance = {options.tolerance}\n')
-    script = folder / "run.py"  # a file: worker processes import their main module
+    script = folder / "run.py"  # a file, because worker processes import their main module
     script.write_text(RUN)
     begin = time.perf_counter()
     done = subprocess.run([sys.executable, str(script), str(folder / "job.toml"), str(workers)], capture_output=True,
                           text=True)
     if done.returncode:
         sys.exit(done.stderr)
-    told = json.loads(done.stdout)
-    if told["bad"] or told["done"] != count:
-        sys.exit(f"{told['bad']} of {count} probes were not baked")
-    return {**told, "wall": time.perf_counter() - begin}
+    used = json.loads(done.stdout)
+    if used["bad"] or used["done"] != count:
+        sys.exit(f"{used['bad']} of {count} probes were not baked")
+    return {**used, "wall": time.perf_counter() - begin}
 
 
 def fit(terms: list[np.ndarray], seconds: np.ndarray) -> np.ndarray:
-    """Coefficients of the terms by least squares of relative errors, so that short runs count as much as long ones."""
+    """Fit coefficients of the terms by least squares of relative errors, so that short and long runs count the same."""
     return np.linalg.lstsq(np.stack(terms, 1) / seconds[:, None], np.ones(len(seconds)), rcond=None)[0]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--items", type=int, nargs="+", default=[1, 30, 100])
-    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256], help="of the inputs' faces")
-    parser.add_argument("--size", type=int, default=128, help="of the output's largest level")
+    parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256], help="sizes of the faces of the probes")
+    parser.add_argument("--size", type=int, default=128, help="size of the largest level of a bake")
     parser.add_argument("--tolerance", type=float, default=1e-3)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--predict", type=int, default=10_000)
@@ -95,22 +97,22 @@ def main() -> None:
             folder = Path(top, str(size))
             folder.mkdir()
             nbytes = probes(folder, most if size == usual else min(most, 30), size)
-            run(folder, 1, options, 1)  # builds kernels where the cache is cold
+            run(folder, 1, options, 1)  # builds the kernels if they are not in the cache
             for workers in options.workers if size == usual else [1]:
                 for count in options.items if size == usual else [1, min(most, 30)]:
-                    told = run(folder, count, options, workers)
-                    files = told["read"] + told["write"]
-                    stages = max(told["compute"], files) / workers
+                    used = run(folder, count, options, workers)
+                    files = used["read"] + used["write"]
+                    stages = max(used["compute"], files) / workers
                     kernels = "", ""
-                    if told["kernels"] is not None:
-                        kernels = f"{told['kernels']:.2f}", f"{told['wall'] / max(told['kernels'], files):.2f}"
-                    rows.append([f"{size}²", f"{workers}", f"{count}", f"{told['wall']:.2f}", f"{told['cpu']:.2f}",
-                                 f"{told['cpu'] / count * 1e3:.0f}",
-                                 *(f"{told[name]:.2f}" for name in ("read", "compute", "write")),
-                                 kernels[0], f"{told['wall'] / stages:.2f}", kernels[1],
-                                 f"{told['peak'] / 1e6:.0f}"])
+                    if used["kernels"] is not None:
+                        kernels = f"{used['kernels']:.2f}", f"{used['wall'] / max(used['kernels'], files):.2f}"
+                    rows.append([f"{size}²", f"{workers}", f"{count}", f"{used['wall']:.2f}", f"{used['cpu']:.2f}",
+                                 f"{used['cpu'] / count * 1e3:.0f}",
+                                 *(f"{used[name]:.2f}" for name in ("read", "compute", "write")),
+                                 kernels[0], f"{used['wall'] / stages:.2f}", kernels[1],
+                                 f"{used['peak'] / 1e6:.0f}"])
                     if workers == 1:
-                        points.append((size == usual, count, count * nbytes, told["cpu"], told["wall"]))
+                        points.append((size == usual, count, count * nbytes, used["cpu"], used["wall"]))
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
     for row in [head, *rows]:
         print("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)))

@@ -1,7 +1,9 @@
-"""What kernels do against what the device can, and the prefilter's error against its time, for the demo and every
-environment in the folder WHITEFURNACE_ENVIRONMENTS names: `whitefurnace bench` and `whitefurnace bench tradeoff`.
+"""Measures the kernels against the limits of the device, and the prefilter's error against its time.
 
-    python benchmarks/bench.py [-n RUNS] [--markdown | --readme] [--plot DIR]
+Runs `whitefurnace bench` and `whitefurnace bench tradeoff`, the latter for the demo and every environment in the folder
+that WHITEFURNACE_ENVIRONMENTS names.
+
+    python benchmarks/bench.py [-n RUNS] [--markdown | --docs] [--plot DIR]
 
 --docs writes the tables into docs/bench.md and the plot into docs/pictures.
 """
@@ -20,24 +22,26 @@ PAGE = HERE.parent / "docs/bench.md"
 
 
 def environments() -> list[str]:
+    """Return the sources of the trade-off: paths of environments, and `demo`."""
     folder = os.environ.get("WHITEFURNACE_ENVIRONMENTS")
     found = [p for p in sorted(Path(folder).iterdir()) if p.suffix in (".exr", ".hdr")] if folder else []
     return [*map(str, found), "demo"]
 
 
 def bench(*arguments: str) -> list[dict]:
-    """The JSON rows of one run."""
+    """Run `whitefurnace bench`; return its JSON rows."""
     done = subprocess.run([sys.executable, "-m", "whitefurnace", "bench", *arguments, "--json"], stdout=subprocess.PIPE,
                           text=True, check=True)
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 def number(value: float | None) -> str:
-    """Three digits and no exponent."""
+    """Return a number with three digits and no exponent; an empty text for None."""
     return "" if value is None else f"{float(f'{value:.3g}'):g}"
 
 
 def three(row: dict, factor: float = 1.0) -> str:
+    """Return the median, the minimum and the maximum of a row as text."""
     return "{} ({} … {})".format(*(number(factor * row[name]) for name in ("median", "min", "max")))
 
 
@@ -46,7 +50,7 @@ def machine(device: dict) -> str:
 
 
 def throughput(rows: list[dict]) -> tuple[str, list[str], list[list[str]]]:
-    """Heading, columns, and a row for each kernel with its figures in float32 and float64."""
+    """Return a heading, the columns, and a row for each kernel with its rates in float32 and float64."""
     can = next(row for row in rows if row["event"] == "yardstick")
     peaks = ", ".join(f"{three(spread)} GFLOP/s in {name}" for name, spread in can["gflops"].items())
     said = (f"{machine(can['device'])} Multiply-adds {peaks}; memory read {three(can['read_gbytes'])} GB/s, triad "
@@ -66,7 +70,7 @@ def throughput(rows: list[dict]) -> tuple[str, list[str], list[list[str]]]:
 
 
 def tradeoff(rows: list[dict]) -> tuple[str, list[str], list[list[str]]]:
-    """Heading, columns, and a row for each setting with its time and error on every environment."""
+    """Return a heading, the columns, and a row for each setting with its time and error on every environment."""
     found = {(row["method"], row["setting"], row["environment"]): row for row in rows if row["event"] == "point"}
     names = list(dict.fromkeys(name for _, _, name in found))
     table = []
@@ -110,7 +114,7 @@ def main() -> None:
             if not block.search(text):
                 sys.exit(f"docs/bench.md has no <!-- {name}: … --> … <!-- end -->")
             PAGE.write_text(block.sub(lambda found, part=part: found[1] + markdown(*part) + "\n" + found[2], text),
-                              "utf-8")
+                            "utf-8")
         print(markdown(*part) if options.markdown else plain(*part), end="\n\n")
 
 

@@ -1,5 +1,7 @@
-"""What an integral costs and how exact it says it is: the directional albedo of every NDF with Smith's masking over
-256 cosines × 64 roughnesses, in float32 and float64, on a warm kernel cache.
+"""Measures the time and the estimated error of an integral.
+
+The integral is the directional albedo of every NDF with Smith's masking over 256 cosines × 64 roughnesses, in float32
+and float64, on a warm kernel cache.
 
     python benchmarks/integrals.py [-n RUNS] [--markdown]
 """
@@ -36,7 +38,7 @@ def main() -> None:
                 return integrate("albedo", ndf=name, NoV=NoV, precision=precision, tolerance=TOLERANCE, device=device,
                                  **parameters)
 
-            run()  # builds kernels where the cache is cold
+            run()  # builds the kernels if they are not in the cache
             runs = [run() for _ in range(options.runs)]
             seconds = [done.seconds for done in runs]
             work = runs[0].evaluations

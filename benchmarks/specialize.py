@@ -1,5 +1,7 @@
-"""What specialization saves: the prefilter's convolution with its NDF bound by #define, against the same kernel with
-all isotropic NDFs compiled in and one chosen by a number at run time.
+"""Measures the gain of specialized kernels in the prefilter's convolution.
+
+Compares the kernel with its NDF bound by #define to the same kernel with all isotropic NDFs compiled in, of which a
+number selects one at run time.
 
     python benchmarks/specialize.py [-n RUNS] [--outputs N] [--precision 32|64]
 """
@@ -21,20 +23,25 @@ from whitefurnace.prefiltering.plan import CHUNK
 
 ROUGHNESS = 0.5
 MOST = 4
-"""Numbers of an NDF at most: what the general kernel is given."""
+"""Largest number of parameters of an NDF; the general kernel receives this many."""
 
 
 def isotropic() -> list[Model]:
+    """Return the isotropic NDFs."""
     return [entry for name in models("ndf") if (entry := model("ndf", name)).isotropic]
 
 
 def text_of(name: str) -> str:
+    """Return the text of a kernel file."""
     return (resources.files("whitefurnace.kernels") / name).read_text("utf-8")
 
 
 def switched(per_pair: bool) -> str:
-    """The program with all NDFs, of `ndf` chosen at run time: by a switch at each pair, as a shader with a uniform has
-    it, or by the branch of an `if` for each, all of which a compiler may hoist."""
+    """Return the text of the program with all NDFs, of which the argument `ndf` selects one at run time.
+
+    per_pair: select by a switch at each pair, as a shader with a uniform does; else by an `if` for each NDF, which a
+    compiler may hoist out of the loop.
+    """
     entries = isotropic()
     given = ", ".join(f"scalar n{k}" for k in range(MOST))
     numbers = ", ".join(f"n{k}" for k in range(MOST))
@@ -54,7 +61,7 @@ def switched(per_pair: bool) -> str:
 
 
 def numbers(device: Device, entry: Model) -> list[float]:
-    """Its numbers at the roughness of the benchmark, in the order in which D takes them."""
+    """Return the parameters of an NDF at the roughness of the benchmark, in the order of D's arguments."""
     given = entry.from_roughness(ROUGHNESS) if entry.from_roughness else {}
     row = np.array([[given.get(p.name, p.default)] for p in entry.parameters], np.float64).reshape(-1, 1)
     found = dict(zip(entry.arguments, numbers_of(device, entry, row)[:, 0].tolist(), strict=True))
@@ -62,8 +69,11 @@ def numbers(device: Device, entry: Model) -> list[float]:
 
 
 def built(device: Device, text: str, precision: int, launch: Callable[[Kernel], None]) -> tuple[Kernel, float]:
-    """The kernel, and the processor seconds of its build with a first small launch, at which PoCL compiles for the
-    sizes. The text is new to every cache, by a function that no other has."""
+    """Build the kernel; return it with the processor seconds of the build and a first small launch.
+
+    PoCL compiles for the sizes of a launch at the first one. A function with a unique name keeps the text out of every
+    cache.
+    """
     fresh = f"{text}\nint fresh_{os.getpid()}_{time.time_ns()}(void) {{ return 0; }}\n"
     begin = time.process_time()
     program = device.build(fresh, {"W": device.lanes(precision), "T": device.vectors, "PRECISION": precision})
@@ -95,7 +105,7 @@ def main() -> None:
         device.array(listed)
 
     def seconds(kernel: Kernel, last: list[np.generic], sources: int = count) -> float:
-        """Of all processors (of the wall on a GPU); variants take turns, so that what else runs is in all of them."""
+        """Return the processor seconds of a launch, or wall seconds on a GPU. Variants take turns to share other load."""
         clock = time.process_time if device.type == "cpu" else time.perf_counter
         begin = clock()
         device.launch(kernel, (outputs // lanes // device.vectors, 2), (
@@ -107,7 +117,7 @@ def main() -> None:
         return lambda kernel: seconds(kernel, last, 1) and None
 
     none = [np.int32(0), *(kind.type(1) for _ in range(MOST))]
-    first = isotropic()[0]  # what the compiler does once is in none of them
+    first = isotropic()[0]  # an untimed build first, for the one-time work of the compiler
     built(device, source.convolution(first).text, precision, once([kind.type(x) for x in numbers(device, first)]))
     general = {name: (text := switched(pair), *built(device, text, precision, once(none)))
                for name, pair in (("switch", True), ("if", False))}
