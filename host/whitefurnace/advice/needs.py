@@ -143,7 +143,7 @@ def read_shares(found: Sequence[Lobe], recipe: Chain) -> np.ndarray:
         for low, high, share in lobe.roughness.shares:
             low, high = max(low, lobe.roughness.least), max(high, lobe.roughness.least)
             first, last = recipe.lod(low), recipe.lod(high)
-            # Every level between the two, though a part of r be small.
+            # Fine enough that no level between the two is missed, however small the range of r.
             lods = np.linspace(first, last, 2 + math.ceil(4 * (last - first)))
             hats = np.maximum(1 - np.abs(lods[:, None] - np.arange(len(weights))), 0)
             weights += share * hats.mean(0) / len(found)

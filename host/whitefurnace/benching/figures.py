@@ -51,7 +51,7 @@ def draw_tradeoff(folder: Path, points: Sequence[Point], costs: Sequence[Cost], 
 def _tradeoff(points: Sequence[Point], axes: Axes) -> None:
     best = sorted((p.seconds.median, p.error) for p in points if p.front)
     if best:
-        # What is on the front is to be had in that time and all longer ones.
+        # The error of a point on the front is reached in its time and in all longer ones.
         x, y = (np.array(v) for v in zip(*best, strict=True))
         last = max(p.seconds.high for p in points)
         axes.step(np.append(x, last), np.append(y, y[-1]), where="post", color="0.85", linewidth=6, zorder=1,

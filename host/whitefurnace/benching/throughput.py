@@ -382,7 +382,7 @@ def _pyramid(device: Device, precision: int, scale: int) -> Work:
     """The pyramid of a cube."""
     size = 1 << min(4 + scale.bit_length(), 10)
     means, texels = Means(device, _rng().random((6, size, size, 3), np.float32), 0.0), 6.0 * size**2
-    # 4 scalars a texel and a third more for the coarser levels, which read what was written.
+    # A texel has 4 scalars; the coarser levels, which read what was written, add a third.
     return Work(lambda sampler: sampler.pyramid(size), texels, texels * (12 + precision / 8 * 4 * (4 / 3 + 1)),
                 lambda: Sampler(means, precision))
 
@@ -577,7 +577,7 @@ def _demo(device: Device, precision: int, scale: int) -> Work:
     return Work(lambda _: device.launch(kernel, (count,), arguments), 2.0 * rows**2 * cuts**2, 12 * 2.0 * rows**2)
 
 
-# One entry a kernel: tests/test_bench.py asks for one of every file that has a kernel.
+# One entry a kernel. tests/benching/test_bench.py requires one for every file that has a kernel.
 CASES = (
     Case("convolve", "prefilter.cl", "pair", "a lobe, GGX, over a list of sources, every pair", _convolve),
     Case("octahedral", "octahedral.cl", "pair", "the same over a grid, by the symmetries of the cube", _octahedral),
@@ -639,7 +639,7 @@ def throughput(wanted: Sequence[Case], device: Device, meter: BenchMeter, runs: 
         for _ in range(runs):  # in turn, so that a disturbance meets the yardsticks too
             peaks.append(meter.peak(precision))
             memories.append(meter.read())
-            # A driver without a clock for kernels gives 0, for which there is no rate.
+            # A driver without a clock for kernels gives 0 seconds, from which no rate follows.
             rates.append(work.units / max(_seconds(device, work), 1e-9))
         rate, flops, nbytes = Spread.of(rates), FLOPS.get(case.name), work.nbytes / work.units
         ratio = [statistics.median(r / y / 1e9 for r, y in zip(rates, by, strict=True)) for by in (peaks, memories)]

@@ -51,7 +51,7 @@ def rank(n: int) -> int:
     The bound holds at 95 % confidence: the probability that so few errors or fewer lie above the percentile is at most
     5 % (order statistic). The index is 0, the largest error, for n = 299, the fewest texels that give a bound.
     """
-    # The logarithm, since .99^n is less than any float64 beyond 74 000.
+    # The sum uses logarithms, since .99^n underflows float64 beyond n = 74 000.
     found, chance, below = -1, n * math.log(QUANTILE), 0.0
     while below + math.exp(chance) <= 1 - CONFIDENCE:
         below += math.exp(chance)

@@ -126,7 +126,7 @@ class Convolver:
             level = self.device.empty((*shape.dims, 3), np.float32)
             self._sum_parts(level, lobe, shape, n, bright, error, share)
             return level.read()
-        # A level of more texels than its lobe lets it have detail: convolved at nodes, read at texels.
+        # The level has more texels than its lobe has detail, so it is convolved at nodes and read at texels.
         grid = self.device.empty((6, nodes, nodes, 4), np.float32)
         self._sum_parts(grid, lobe, Shape(False, nodes, nodes=True), n, None, error, share)
         level = self.device.empty((*shape.dims, 3), np.float32)
@@ -188,7 +188,7 @@ class Convolver:
                       for _, directions in wanted]
             return [np.concatenate([self.exact([(lobe, piece)], cuts, tolerance)[0] for piece in some])
                     for (lobe, _), some in zip(wanted, pieces, strict=True)]
-        # What lies beyond the window of narrow lobes errs by up to 3e-5.
+        # Beyond the window of narrow lobes the sum errs by up to 3e-5.
         coarse = self.texels.centred and cuts > max(planning.CENTRED) and tolerance >= 1e-4
         if wanted and coarse and all(_narrow(lobe) for lobe, _ in wanted):
             return [self.exact_narrow(lobe, directions, cuts, tolerance) for lobe, directions in wanted]

@@ -89,7 +89,7 @@ class _Lobes:
             D = np.stack([np.broadcast_to(entry.reference["D"](theta / 2, **row), theta.shape) for row in rows])
         else:
             given = np.array([[row[p.name] for row in rows] for p in entry.parameters], np.float64)
-            # A user's: its norm and width as 1, since any factor of a lobe cancels.
+            # For a user's NDF norm and width are set to 1, since any factor of a lobe cancels.
             ones = np.ones((len(entry.constant_names), len(rows)))
             numbers = np.concatenate([given.reshape(len(entry.parameters), len(rows)), ones])
             angles = np.stack([np.cos(theta / 2), np.sin(theta / 2) ** 2])
@@ -147,7 +147,7 @@ def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
     kernels = lobes.at(theta, nodes)
     ring = 2 * math.pi * np.sin(theta) * weight
     kernels /= (kernels @ ring)[:, None]
-    # Scored r: midpoints in lod, in each segment.
+    # Reads are scored at midpoints in lod, in each segment.
     per = min(max(TOGETHER // (levels - 1), FEWEST), MOST)
     steps = (np.arange(per * (levels - 1)) + 0.5) / per
     scored = roughness(steps)
@@ -170,11 +170,11 @@ def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
     gram, right, rest = (np.stack(part) for part in zip(*scenes, strict=True))
 
     def rms(c: np.ndarray) -> np.ndarray:
-        # Rounding of the difference: an RMS of 1e-4 is far below any that matters.
+        # Bounds the rounding of the difference: an RMS of 1e-4 is far below any that matters.
         return np.sqrt(np.maximum(gram @ c @ c - 2 * right @ c + rest, 1e-8))
 
     before = rms(own) @ share
-    # Each angle relative to the largest of the level's lobes there: Beckmann's fall by 10^300.
+    # Values are relative to the largest of the level's lobes at each angle: Beckmann's fall by 10^300.
     largest = np.stack([kernels[level == k].max(0) for k in range(1, levels)])[level - 1]
     allowed = np.divide(kernels, largest, out=np.zeros_like(kernels), where=largest > 0)
     least = LEAST * allowed[np.flatnonzero(own)]  # (levels - 1, θ)
@@ -224,7 +224,7 @@ def _constrained(a: np.ndarray, b: np.ndarray, sums: np.ndarray, allowed: np.nda
         rows = np.array([np.where(level == k, allowed[:, t], 0.0) for k, t in held]).reshape(len(held), count)
         z = np.concatenate([sums, rows])
         values = np.array([1.0] * len(sums) + [least[k - 1, t] for k, t in held])
-        # A trace of regularization where two held angles say nearly the same.
+        # A little regularization, since two constrained angles may be nearly the same.
         system = np.block([[a, z.T], [z, -1e-13 * np.eye(len(z))]])
         solution = np.linalg.solve(system, np.concatenate([b, values]))
         return solution[:count], solution[count + len(sums):]

@@ -148,7 +148,7 @@ def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str 
             for job, level in zip(jobs, levels[:-1], strict=True)]
     coverage: list[Level] = []
     if env.coverage is not None:
-        # Coverage is light of one channel: the same chain, the same statement.
+        # Coverage is filtered and certified as light of one channel.
         grey = np.repeat(env.coverage[..., None], 3, -1)
         share = float(np.average(env.coverage, weights=source_solid_angles(env)))
         as_light = replace(env, texels=grey, coverage=None, statistics={"mean": [share] * 3})

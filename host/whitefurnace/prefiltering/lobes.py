@@ -96,7 +96,7 @@ def _chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _fit(density: Callable[[np.ndarray], np.ndarray], norm: float, low: float, high: float, error: float) -> Series:
     ends = density(np.array([low, low + 0.3 * (high - low), high]))
-    # Where D is GGX's, 1/√D is a line, and this shift leaves a constant: tried first.
+    # For GGX 1/√D is a line, and this shift leaves a constant, so it is tried first.
     shifts = []
     root = 1 / np.sqrt(np.maximum(ends, 1e-300))
     for other, q in ((1, low + 0.3 * (high - low)), (2, high)):
@@ -110,9 +110,9 @@ def _fit(density: Callable[[np.ndarray], np.ndarray], norm: float, low: float, h
     x = middle[:, None] + half[:, None] * y
     q = np.clip(1 / x - shift[:, None], low, high)
     D = density(q.ravel()).reshape(q.shape)
-    # ∫ x^power (1 - q/2) dq, for what an error of P weighs; dω = π dq, dq = dx/x².
+    # ∫ x^power (1 - q/2) dq is the weight of an error of P; dω = π dq, dq = dx/x².
     jacobian = half[:, None] * np.sqrt(1 - y * y) * math.pi / NODES / x**2
-    # Nodes crowd where a candidate's map puts them, perhaps far from what matters: its error is taken elsewhere.
+    # A candidate's map may put its nodes far from the lobe's energy, so its error is measured at other points.
     edges = np.geomspace(1e-10, high - low, CHECKS)
     edges = np.unique(np.concatenate([[low, high], low + edges, high - edges]))
     at = (edges[1:] + edges[:-1]) / 2
@@ -148,7 +148,7 @@ def ndf_lobe(device: Device, choice: Chosen, roughness: float, parameters: Mappi
     rows = np.array([[parameters[p.name]] for p in entry.parameters], np.float64).reshape(-1, 1)
     numbers = tuple(numbers_of(device, entry, rows)[:, 0].tolist())
     norm = lobe_norm(device, entry, parameters)
-    # The slope of K/∫K at the horizon is α²/π for GGX. A lobe that lies there altogether (sheen) falls in 1/horizon.
+    # The slope of K/∫K at the horizon is α²/π for GGX. A lobe that lies there entirely (sheen) has the width 1/horizon.
     horizon = math.sqrt(math.pi * at_horizon(device, entry, parameters) / norm)
     return Lobe(f"r = {roughness:.3f}", ((entry, numbers, 1.0),), norm,
                 min(max(roughness * roughness, 1e-5), 1 / max(horizon, 1.0)), max(horizon, 1e-5),
@@ -170,7 +170,7 @@ def mixture_lobe(device: Device, choice: Chosen, parts: Sequence[tuple[float, fl
     def density(q: np.ndarray) -> np.ndarray:
         return np.sum([weight / lobe.norm * lobe.density(q) for weight, lobe in lobes], 0)
 
-    # The sharpest summand with a share that is seen says how fine a grid must be; the slope at the horizon adds up.
+    # The sharpest summand with a visible share decides how fine a grid must be; the slopes at the horizon add up.
     alpha = min(lobe.alpha for weight, lobe in lobes if abs(weight) > 1e-4)
     horizon = math.sqrt(sum(max(weight, 0.0) * lobe.horizon**2 for weight, lobe in lobes))
     return Lobe(name, summands, 1.0, alpha, max(horizon, 1e-5), density)

@@ -73,7 +73,7 @@ class Means:
         if self._same_texels(shape):
             return self.texels.copy()
         if not self.device.fp64:
-            # Float32 places edges to 1e-5 of a texel, and a sliver of sun is brighter than that: the host's float64.
+            # Float32 places edges to 1e-5 of a texel, too coarse for a sliver of sun, so the host computes in float64.
             parts = [self.exact(shape, part)
                      for part in np.array_split(np.arange(shape.count), -(-shape.count // 4096))]
             return np.concatenate(parts).astype(np.float32).reshape(*shape.dims, 3)
@@ -118,7 +118,7 @@ class Means:
                       (level, np.int32(shape.size), np.int32(self.rows), *make(self.device, self.rows, shape.size),
                        self.radiance))
             return level.read()
-        # Sagitta of a chord of a parallel against the texel's height: (Δφ/chords)²/8 : Δθ ≤ 2e-6, where 48 do.
+        # The sagitta of a parallel's chord is at most 2e-6 of the texel's height, (Δφ/chords)²/8 : Δθ; 48 chords do.
         chords = min(48, max(2, math.ceil(math.sqrt(math.pi / shape.size / 8 / 2e-6))))
         out = np.empty((shape.count, 3), np.float32)
         for first in range(0, shape.count, TILE):
@@ -143,7 +143,7 @@ def _run(device: Device, program: Program, name: str, count: int, args: Sequence
 
 def _pieces(device: Device, n: int, size: int) -> tuple[np.int32, Buffer, Buffer, Buffer]:
     """The pieces into which the edges of faces of n and of `size` texels cut a face, as `mean_aligned` takes them."""
-    # In units of 1/(n · size), so that edges that meet are equal.
+    # Edges are in units of 1/(n · size), so that edges that meet are equal.
     edges = np.union1d(np.arange(n + 1) * size, np.arange(size + 1) * n)
     x = edges * (2 / (n * size)) - 1
     corner = np.arctan(x[:, None] * x / np.sqrt(1 + x[:, None] ** 2 + x * x))
@@ -203,7 +203,7 @@ def _lists(device: Device, rows: int, columns: int, rotation: float, size: int,
 
 def _grids(device: Device, rows: int, columns: int, rotation: float, size: int, count: int) -> tuple[Any, ...]:
     theta = np.arange(rows + 1) * (math.pi / rows)
-    # 1 - cos θ as a square keeps its digits at the pole; the poles' cotangents are bounds and nothing else.
+    # 1 - cos θ as a square keeps its digits at the pole; the cotangents of the poles only serve as bounds.
     cotangent = np.concatenate([[1e300], 1 / np.tan(theta[1:-1]), [-1e300]])
     if rows % 2 == 0:
         cotangent[rows // 2] = 0.0

@@ -268,7 +268,7 @@ def parts_for(n: int, alpha: float, horizon: float | None = None) -> tuple[Part,
     def q1(theta: float) -> float:
         return 2 - 2 * math.cos(theta)
 
-    # rest[k]: cost and angles of the cheapest way on beyond angle k, from the widest inwards.
+    # rest[k] is the cost and the angles of the cheapest partition beyond angle k, from the widest inwards.
     widest = angles[::-1]
     rest: list[tuple[float, tuple[float, ...]]] = []
     for theta in widest:

@@ -88,7 +88,7 @@ def taps(size: int, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         column, row = j + k % 2, i + k // 2
         beyond_x, beyond_y = (column < 0) | (column >= size), (row < 0) | (row >= size)
         missing[k] = beyond_x & beyond_y
-        # A hair over the edge: where that lies on the next face is the texel that meets it.
+        # The point just over the edge lies in the texel of the next face that meets it.
         over = 1 + 1e-9
         a = np.where(beyond_x, np.sign(column + 0.5) * over, (2 * column + 1) / size - 1)
         b = np.where(beyond_y, np.sign(row + 0.5) * over, (2 * row + 1) / size - 1)
@@ -196,7 +196,7 @@ class Exact:
                                             TOLERANCE)
                 for job, value in zip(jobs, found, strict=True):
                     values[job] = value / convolver.scale
-                # Charlie's lobe, all of it in the last degrees above the horizon, is below float32 where it is thin.
+                # Charlie's lobe lies in the last degrees above the horizon, and underflows float32 where it is thin.
                 jobs = [job for job in jobs if not np.isfinite(values[job]).all()]
                 if not jobs:
                     break

@@ -132,7 +132,7 @@ class Lods:
         for _ in range(60):
             middle = (low + high) / 2
             low, high = (middle, high) if self._lod(middle, levels, width) < lod else (low, middle)
-        # To 12 digits, so that a level at r = 1 is exactly that.
+        # Rounded to 12 digits, so that a level at r = 1 is exactly that.
         return round(high, 12)
 
     def _lod(self, roughness: float, levels: int, width: int) -> float:

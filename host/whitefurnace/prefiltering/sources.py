@@ -55,7 +55,7 @@ class Texels:
         self.rows, self.columns = e.texels.shape[-3:-1]
         self.faces = 1 if self.latlong else 6
         mean = float(np.mean(e.statistics["mean"]))
-        # Within ±100, so that neither the factor nor what it multiplies leaves float32.
+        # The exponent is within ±100, so that neither the factor nor its products leave float32.
         self.scale = 2.0 ** min(max(-round(math.log2(mean)), -100), 100) if mean > 0 else 1.0
         self.values = device.aligned_empty(e.texels.shape, np.float32)
         np.multiply(e.texels, np.float32(self.scale), out=self.values)

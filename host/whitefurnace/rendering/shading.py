@@ -148,7 +148,7 @@ def split_sum(engine: Engine, dfg: np.ndarray | None, NoV: np.ndarray,
     at = []
     for axis, count in ((engine.dfg.x, width), (engine.dfg.y, height)):
         if axis == "NoV":
-            # √NoV has its ends on texels: u = (√NoV (N - 1) + ½)/N, in texels √NoV (N - 1).
+            # An axis of √NoV has its ends on texels: u = (√NoV (N - 1) + ½)/N, which is texel √NoV (N - 1).
             place = np.sqrt(NoV) * (count - 1) if engine.dfg.NoV == "sqrt" else NoV * count - 0.5
         else:
             place = (roughness if axis == "roughness" else roughness**2) * count - 0.5
@@ -444,7 +444,7 @@ def sphere(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     far = np.hypot(x, y)
     cover = np.clip((1 - far) * radius + 0.5, 0, 1)
     index = np.flatnonzero(cover)
-    # Short of the rim, where n·v would be 0.
+    # Normals stay short of the rim, where n·v would be 0.
     short = np.minimum(far[index], 1 - 1e-6) / np.maximum(far[index], 1e-300)
     x, y = x[index] * short, y[index] * short
     return index, cover[index], np.stack([x, y, np.sqrt(1 - x * x - y * y)])

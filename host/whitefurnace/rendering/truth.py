@@ -245,7 +245,7 @@ class Truth:
         cuts = math.ceil(texel_of(self.env) / (NEAR * width))
         if count * cuts**2 > MOST_CUT and cuts > 1:
             return None
-        # As many as there is room for: a texel that sets is not all or nothing then.
+        # As many cuts as there is room for, so that a setting texel fades in steps.
         cuts = max(cuts, min(math.isqrt(LIGHTS // max(count, 1)), 16))
         if cuts > 1:
             return cut(self.env, self.excess, cuts)

@@ -101,7 +101,7 @@ def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
         raise InputError(f"{scene.path} has no materials that light falls on: there is nothing to draw")
     notices = []
     if len(lit) > MOST:
-        # No areas are read: primitives stand for them, the earlier of the file first.
+        # Areas are not known, so materials with the most primitives are kept, earlier ones of the file first.
         kept = sorted(sorted(range(len(lit)), key=lambda k: (-lit[k].uses, k))[:MOST])
         notices.append(f"{scene.path} has {len(lit)} materials that light falls on: drawn are the {MOST} that most of "
                        "its primitives have, their surface is not known")
@@ -146,7 +146,7 @@ def insulator(m: Material) -> Triple:
     return _triple(np.minimum(f0 * tint, 1) * weight)
 
 
-# What a sphere does not show of a material: when it has it, and what is drawn in its place.
+# Properties of a material that a sphere does not show: name, test for it, and what is drawn instead.
 _KINDS: tuple[tuple[str, Callable[[Material], bool], str], ...] = (
     ("clear coat", lambda m: m["clearcoat"].most > 0, "the surface under it is drawn"),
     ("sheen", lambda m: m["sheen_color"].most > 0, "the layer under it is drawn, unscaled"),

@@ -216,7 +216,7 @@ def library() -> Any:
     return pygltflib
 
 
-# Extensions that a file may require: what they change is read, or changes neither materials nor extent.
+# Extensions that a file may require: they are read, or they change neither materials nor extent.
 _ALLOWED = KNOWN | {"KHR_texture_transform", "KHR_lights_punctual", "KHR_mesh_quantization", "KHR_materials_variants",
                     "EXT_mesh_gpu_instancing", "KHR_draco_mesh_compression", "EXT_meshopt_compression",
                     "KHR_texture_basisu", "EXT_texture_webp", "KHR_animation_pointer", "KHR_node_visibility",
@@ -445,7 +445,7 @@ class _Reading:
         if extension == "":
             return material, what
         if extension == _PBR:
-            # What is no object, pygltflib hands on.
+            # pygltflib passes on values that are not objects.
             self.take.object(self.raw[k].get(_PBR, {}), f"{_PBR} of {what}")
             return material.pbrMetallicRoughness, f"{_PBR} of {what}"
         extensions = self.take.object(material.extensions or {}, f"extensions of {what}")
@@ -613,7 +613,7 @@ def _tiles(boxes: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """Tiles (rows, columns) of the image, bool, that boxes touch, and their neighbours, which a filter reads too."""
     x0, y0 = (np.clip(np.floor(boxes[:, k] * n).astype(int) - 1, 0, n) for k, n in ((0, columns), (1, rows)))
     x1, y1 = (np.clip(np.floor(boxes[:, k] * n).astype(int) + 2, 0, n) for k, n in ((2, columns), (3, rows)))
-    # Corners of each box; their running sums along both axes count the boxes over a tile.
+    # The running sums of the boxes' corners along both axes count the boxes over a tile.
     edge = np.zeros((rows + 1, columns + 1), np.int64)
     for y, x, sign in ((y0, x0, 1), (y1, x1, 1), (y0, x1, -1), (y1, x0, -1)):
         np.add.at(edge, (y, x), sign)

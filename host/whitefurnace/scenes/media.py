@@ -85,7 +85,7 @@ def named_media(texts: Sequence[str], scene: Scene) -> dict[str, Medium]:
     found: dict[str, Medium] = {}
     names = [m.name for m in scene.materials]
     for text in texts:
-        # A name of a material may have colons itself.
+        # The name of a material may contain colons.
         name, _, rest = text.rpartition(":")
         if name and name not in names:
             raise UsageError(f"--medium {text}: no material is named {name!r}{nearest(name, names)}")
@@ -213,12 +213,12 @@ def _judged(scene: Scene, pixel: Pixel | None, m: Material | None, medium: Mediu
         return Inside(name, judgement, size_of)
     if not (all(s > 0 for s in medium.scattering) and all(map(math.isfinite, medium.absorption))):
         return Inside(name, judgement, size_of, "no table of diffusion: a channel of it does not scatter")
-    # Air and water are no schemes of `lut diffusion`; what has numbers of its own is a dipole.
+    # `lut diffusion` has no schemes for air and water; a medium given by numbers is a dipole.
     own = MEDIA.get(medium.name) == medium and medium.name not in ("air", "water")
     table: dict[str, Any] = {"kind": "diffusion", "output": "", "size": TABLE,
                              "scheme": medium.name if own else "dipole"}
     if not own:
-        # Of scattering the dipole has σs(1 - g) alone: any g is within what `lut` takes.
+        # The dipole depends only on σs(1 - g), so g = 0 with the reduced scattering is the same and in `lut`'s range.
         r, g, b = medium.reduced.tolist()
         even = replace(medium, scattering=(r, g, b), g=0.0)
         table["set"] = [f"{key}={value:.9g}" for key, value in even.parameters().items()]

@@ -354,7 +354,7 @@ def _left(medium: Medium, size: float | None, pixel: float) -> Transport:
         return Transport(verdict, medium.mean_free_path, medium.diffusion_length, medium.albedo, medium.spread, share,
                          reason)
 
-    # Where it goes straight on is no longer white: what Hoffman's "clear" and "cloudy" differ by.
+    # The share of light that goes straight on decides between Hoffman's "clear" and "cloudy".
     straight = None if size is None else np.exp(-np.array(medium.scattering) * size)
     if not any(medium.scattering):
         return say("clear", "nothing scatters inside: light is refracted and absorbed, none is diffuse")
