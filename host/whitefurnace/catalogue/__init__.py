@@ -1,4 +1,4 @@
-"""Pure data about every model and integral, with float64 references; imports numpy only.
+"""Data about every model and integral, with float64 references.
 
 A model is one entry here (`catalogue/SLOT/NAME.py`, a module with `ENTRY`) and one kernel file
 (`kernels/SLOT/NAME.clh`). Entries are found by listing the folders, so adding a model touches nothing else.

@@ -1,4 +1,4 @@
-"""A model as it is chosen: its entry and the parameters given with it."""
+"""A model as a user chooses it: an entry of the catalogue or a file, and the parameters given with it."""
 from __future__ import annotations
 
 import hashlib
@@ -17,12 +17,13 @@ from whitefurnace.errors import UsageError, nearest
 
 @dataclass(frozen=True)
 class Chosen:
-    """A model and the parameters given with it (the rest follow from roughness or have defaults)."""
+    """A model and the parameters given with it. The others follow from roughness or have defaults."""
 
     model: Model
     given: Mapping[str, float | tuple[float, ...]]
 
     def canonical(self) -> dict[str, Any]:
+        """Return the choice as plain data, for keys and manifests: name, digest of a file, sorted parameters."""
         text = self.model.text
         source = {} if text is None else {"sha256": hashlib.sha256(text.encode()).hexdigest()}
         return {"name": self.model.name, **source, **dict(sorted(self.given.items()))}
@@ -31,16 +32,17 @@ Spec = str | os.PathLike[str] | Model | Chosen
 
 
 def file_of(spec: str) -> str | None:
-    """The path of `FILE.clh[:p=v,…]`, whose folders may have any name; None for what is no file."""
+    """Return the path in `FILE.clh[:p=v,…]`, whose folders may have any name; None where `spec` names no file."""
     found = re.match(r"(.*\.clh)(?::|$)", spec, re.DOTALL)
     return found[1] if found else None
 
 
 def chosen(slot: str, spec: Spec) -> Chosen:
-    """A model from `NAME`, `NAME:PRESET`, `NAME:p=v,…`, `FILE.clh[:p=v,…]`, a catalogue entry or what was chosen.
+    """Return the choice that `spec` stands for, with its parameters checked.
 
-    A value is a number, or three for RGB (`f0=1/.71/.29`). Raises UsageError with the nearest name, and what
-    `user_model` raises of a file.
+    slot: "ndf", "masking", "fresnel", "diffuse", "light" or "brdf". spec: `NAME`, `NAME:PRESET`, `NAME:p=v,…`,
+    `FILE.clh[:p=v,…]`, a catalogue entry or a choice. A value is a number, or three for RGB (`f0=1/.71/.29`). Raises
+    UsageError with the nearest name, and what `user_model` raises for a file.
     """
     if isinstance(spec, Chosen):
         return spec
@@ -81,5 +83,5 @@ def chosen(slot: str, spec: Spec) -> Chosen:
 
 
 def is_number(value: object) -> bool:
-    """Whether `value` is one real number, of Python or numpy."""
+    """Return whether `value` is one real number, of Python or numpy."""
     return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)

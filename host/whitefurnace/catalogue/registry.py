@@ -1,4 +1,4 @@
-"""The entries, found in the folders and looked up by name."""
+"""Finds the entries in their folders and gives them by name; lists the integrals."""
 from __future__ import annotations
 
 import importlib
@@ -13,7 +13,7 @@ SLOTS = ("ndf", "masking", "fresnel", "diffuse", "light")
 
 @cache
 def models(slot: str) -> dict[str, Model]:
-    """All models of a slot by name. Raises UsageError for an unknown slot."""
+    """Return all models of a slot by name. Raises UsageError for an unknown slot."""
     if slot not in SLOTS:
         raise UsageError(f"unknown slot {slot!r}{nearest(slot, SLOTS)}")
     package = importlib.import_module(f"whitefurnace.catalogue.{slot}")
@@ -25,7 +25,7 @@ def models(slot: str) -> dict[str, Model]:
 
 
 def model(slot: str, name: str) -> Model:
-    """The model `name` of `slot`. Raises UsageError with the nearest name."""
+    """Return the model `name` of `slot`. Raises UsageError with the nearest name."""
     known = models(slot)
     if name not in known:
         raise UsageError(f"unknown {slot} {name!r}{nearest(name, known)}")
@@ -63,7 +63,7 @@ REFRACTION = Integral("refraction", "Reflected and refracted", 2, ("NDF_D", "MAS
 
 
 def integral(name: str) -> Integral:
-    """The integral `name`. Raises UsageError with the nearest name."""
+    """Return the integral `name`. Raises UsageError with the nearest name."""
     if name not in INTEGRALS:
         raise UsageError(f"unknown integral {name!r}{nearest(name, INTEGRALS)}")
     return INTEGRALS[name]

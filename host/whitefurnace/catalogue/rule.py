@@ -9,15 +9,19 @@ import numpy as np
 
 @cache
 def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre nodes and weights on [0, 1], (n,) float64 each; exact to degree 2n - 1."""
+    """Return Gauss-Legendre nodes and weights on [0, 1], (n,) float64 each; exact to degree 2n - 1."""
     x, w = np.polynomial.legendre.leggauss(n)
     return (x + 1) / 2, w / 2
 
 
 @dataclass(frozen=True)
 class Rule:
-    """A product of Gauss rules: nodes in the two polar panels (`near`, `far`; 0 near where there is one) and in each
-    of `panels` azimuth panels. Of `light-angles` the panels are polar, and the azimuths midpoints of a quarter turn."""
+    """A product of Gauss rules over the polar angle and the azimuth.
+
+    family: the ladder that it belongs to. near, far: nodes in the two polar panels, 0 near where there is one panel.
+    azimuths: nodes in each of `panels` azimuth panels. For `light-angles` the panels are polar, and the azimuths are
+    the midpoints of a quarter turn.
+    """
 
     family: str
     near: int
@@ -27,21 +31,25 @@ class Rule:
 
     @property
     def name(self) -> str:
+        """The name of the rule, as results state it: `gauss-16+32x12`."""
         polar = f"{self.near}+{self.far}" if self.near else f"{self.far}"
         return f"{self.family}-{polar}x{self.azimuths if self.panels == 1 else f'{self.panels}*{self.azimuths}'}"
 
     @property
     def evaluations(self) -> int:
+        """Evaluations of the integrand for one cell."""
         return (self.near + self.far) * self.azimuths * self.panels
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """What a kernel is told of the polar nodes: those of panel 0 where it has two, and all."""
+        """Numbers of polar nodes as kernels take them: those of the first panel where there are two, then all."""
         return (self.near, self.near + self.far) if self.near else (self.far,)
 
     def tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """Polar nodes (near + far, 2) and azimuth nodes (azimuths, 2), as (x, w) pairs in float64; of `light-angles`
-        the azimuths are (sin, 1 - sin) instead, whose weights are equal."""
+        """Return polar nodes (near + far, 2) and azimuth nodes (azimuths, 2), as (x, weight) pairs in float64.
+
+        For `light-angles` the azimuths are (sin, 1 - sin) pairs instead, whose weights are equal.
+        """
         if self.family == "light-angles":
             left = (self.azimuths - 0.5 - np.arange(self.azimuths)) * (np.pi / 2 / self.azimuths)
             return np.stack(gauss(self.far), 1), np.stack([np.cos(left), 2 * np.sin(left / 2) ** 2], 1)

@@ -1,4 +1,4 @@
-"""Light under a surface: published media, how much of what enters them leaves again, and how far from where it entered.
+"""Light under a surface: published media, the reflectance of a half-space, and how far light goes before it leaves.
 
 Lengths are in millimetres and coefficients per millimetre, as the papers have them.
 """
@@ -39,8 +39,12 @@ SKIN = ((0.0064, (0.233, 0.455, 0.649)), (0.0484, (0.100, 0.336, 0.344)), (0.187
 
 
 def diffuse_reflectance(scattering: Any, absorption: Any, ior: float) -> np.ndarray:
-    """What leaves a half-space of what enters it: the integral of the dipole,
-    ½ α' (1 + e^(-4/3 A √(3(1 - α')))) e^(-√(3(1 - α'))), A = (1 + F_dr)/(1 - F_dr). [Jensen2001, after eq. 4]"""
+    """Return the diffuse reflectance of a half-space, by the integral of the dipole.
+
+    scattering, absorption: reduced scattering and absorption, in any one unit of 1/length, ≥ 0. ior: index of
+    refraction. It is ½ α' (1 + e^(-4/3 A √(3(1 - α')))) e^(-√(3(1 - α'))), A = (1 + F_dr)/(1 - F_dr). [Jensen2001,
+    after eq. 4]
+    """
     scattering, absorption = np.asarray(scattering, np.float64), np.asarray(absorption, np.float64)
     # α' = 1/(1 + σa/σs'), which has a value where either is 0 or infinite; 0/0, which does nothing, reflects nothing.
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -59,13 +63,16 @@ def _image(ior: float) -> float:
 
 
 def beyond(radius: Any, lost: Any, ior: float) -> np.ndarray:
-    """The share of what leaves that does so at more than `radius` mean free paths from where it entered, of a dipole
-    that absorbs `lost` = 1 - α' at each collision: (z_r e^(-σ d_r)/d_r + z_v e^(-σ d_v)/d_v)/(e^(-σ z_r) + e^(-σ z_v)),
-    σ = √(3(1 - α')), d = √(r² + z²), since the flux z (1 + σd) e^(-σd)/(4π d³) of each source is -∂/∂d of
-    z e^(-σd)/(4π d) over d. [Jensen2001, eq. 4]
+    """Return the share of the reflected light that leaves at more than `radius` from where it entered, by the dipole.
 
-    The 95 % radius is within 12 % of a random walk's with Fresnel's boundary for α' from .7 (tests/test_scale.py), and
-    a third too long at α' = .3. Christensen and Burley's profile, fitted without a boundary, has half of it.
+    radius: in mean free paths. lost: 1 - α', the share absorbed at each collision, in [0, 1]. ior: index of refraction.
+
+    The share is (z_r e^(-σ d_r)/d_r + z_v e^(-σ d_v)/d_v)/(e^(-σ z_r) + e^(-σ z_v)), σ = √(3(1 - α')), d = √(r² + z²),
+    since the flux z (1 + σd) e^(-σd)/(4π d³) of each source is -∂/∂d of z e^(-σd)/(4π d) over d. [Jensen2001, eq. 4]
+
+    The 95 % radius is within 12 % of a random walk's with Fresnel's boundary for α' from .7
+    (tests/scenes/test_scale.py), and a third too long at α' = .3. Christensen and Burley's profile, fitted without a
+    boundary, has half of it.
     """
     root = np.sqrt(3 * np.asarray(lost, np.float64))
     radius = np.asarray(radius, np.float64)
@@ -75,7 +82,7 @@ def beyond(radius: Any, lost: Any, ior: float) -> np.ndarray:
 
 
 def within(share: float, lost: Any, ior: float) -> np.ndarray:
-    """The radius in mean free paths within which `share` of what leaves does so, by bisection of its logarithm."""
+    """Return the radius in mean free paths within which `share` of the reflected light leaves; see `beyond`."""
     lost = np.asarray(lost, np.float64)
     low, high = np.full(lost.shape, -20.0), np.full(lost.shape, 20.0)
     for _ in range(60):
@@ -86,32 +93,36 @@ def within(share: float, lost: Any, ior: float) -> np.ndarray:
 
 
 def shape(albedo: Any) -> np.ndarray:
-    """The mean free path over d of the profile, for light that arrives along the normal.
-    [ChristensenBurley2015, eq. 5]"""
+    """Return the mean free path over d of Christensen and Burley's profile, for light along the normal.
+
+    albedo: the diffuse reflectance in [0, 1]. [ChristensenBurley2015, eq. 5]
+    """
     albedo = np.asarray(albedo, np.float64)
     return 1.85 - albedo + 7 * np.abs(albedo - 0.8) ** 3
 
 
 @dataclass(frozen=True)
 class Gaussians:
-    """A profile as a sum of Gaussians: `variances` (n,) in mm², `weights` (n, 3)."""
+    """A diffusion profile as a sum of Gaussians: `variances` (n,) in mm², `weights` (n, 3)."""
 
     variances: np.ndarray
     weights: np.ndarray
 
     @property
     def least(self) -> float:
-        """A length over which the line spread still looks flat, mm."""
+        """A length, in mm, over which the line spread still looks flat."""
         return float(np.sqrt(self.variances.min())) / 8
 
     @property
     def widest(self) -> float:
-        """A length over which light goes at most on average, mm."""
+        """A length, in mm, that light goes at most on average."""
         return float(np.sqrt(self.variances.max()))
 
     def line_spread(self, distance: np.ndarray) -> np.ndarray:
-        """(…, 3): what reaches a line at a distance in mm from the one where light enters, ∫ R(√(x² + y²)) dy but for a
-        factor: the same Gaussians in one dimension."""
+        """Return the light that reaches a line at a distance in mm from the line where light enters, (…, 3).
+
+        It is ∫ R(√(x² + y²)) dy up to a factor: the same Gaussians in one dimension.
+        """
         x2 = np.square(distance)[..., None]
         return np.asarray((np.exp(x2 * (-0.5 / self.variances)) / np.sqrt(self.variances)) @ self.weights)
 
@@ -126,21 +137,26 @@ class Burley:
     @property
     def least(self) -> float:
         # The line spread grows like log 1/x: what a first panel is off by must be as short as this.
+        """A length, in mm, over which a first panel may be inexact."""
         return 1e-13 * float(self.d.min())
 
     @property
     def widest(self) -> float:
+        """A length, in mm, that light goes at most on average."""
         return 3 * float(self.d.max())
 
     def line_spread(self, distance: np.ndarray) -> np.ndarray:
-        """(…, 3): ∫ e^(-√(x² + y²)/d)/√(x² + y²) dy = 2 K₀(x/d), so K₀(x/d) + K₀(x/3d) but for a factor."""
+        """Return the line spread, (…, 3) up to a factor, at distances in mm.
+
+        ∫ e^(-√(x² + y²)/d)/√(x² + y²) dy = 2 K₀(x/d), so it is K₀(x/d) + K₀(x/3d).
+        """
         x = np.asarray(distance)[..., None] / self.d
         return np.asarray((special.k0(x) + special.k0(x / 3)) / self.d)
 
 
 @dataclass(frozen=True)
 class Dipole:
-    """Jensen's dipole of a mean free path `path`, (3,) in mm, and `lost` = 1 - α', (3,)."""
+    """Jensen's dipole for a mean free path `path`, (3,) in mm, and `lost` = 1 - α', (3,)."""
 
     path: np.ndarray
     lost: np.ndarray
@@ -148,15 +164,20 @@ class Dipole:
 
     @property
     def least(self) -> float:
+        """A length, in mm, over which the line spread still looks flat."""
         return float(self.path.min()) / 8
 
     @property
     def widest(self) -> float:
         # Without absorption the mean distance is infinite, by a logarithm.
+        """A length, in mm, that light goes at most."""
         return 100 * float(self.path.max())
 
     def line_spread(self, distance: np.ndarray) -> np.ndarray:
-        """(…, 3): -∂/∂z ∫ e^(-σd)/d dy = -∂/∂z 2 K₀(σρ) = 2σ z/ρ K₁(σρ), ρ = √(x² + z²), of source and image."""
+        """Return the line spread, (…, 3) up to a factor, at distances in mm.
+
+        -∂/∂z ∫ e^(-σd)/d dy = -∂/∂z 2 K₀(σρ) = 2σ z/ρ K₁(σρ), ρ = √(x² + z²), for source and image.
+        """
         x, root = np.asarray(distance)[..., None] / self.path, np.sqrt(3 * self.lost)
         total = np.zeros(x.shape)
         for z in (1.0, _image(self.ior)):
@@ -171,4 +192,5 @@ Profile = Gaussians | Burley | Dipole
 
 
 def skin() -> Gaussians:
+    """Return the profile of skin. [dEonLuebke2007, table 14-1]"""
     return Gaussians(np.array([v for v, _ in SKIN]), np.array([w for _, w in SKIN]))

@@ -18,11 +18,12 @@ CONSTANTS = ("per_norm", "lobe_width")
 
 
 def user_model(slot: str, path: str | Path) -> Model:
-    """The model of `path` for the slot `ndf` or `brdf`; its parameters are those its signature names.
+    """Return the model in the file `path` for the slot `ndf` or `brdf`; its signature names its parameters.
 
-    `real ndf_STEM_D(real cos_m, real p1, …)` (a second parameter `sin2_m` gets sin²θ), STEM the file's stem: any
-    scale, the engine normalizes it. `real3 brdf_STEM_f(real3 l, real3 v, …)` in 1/sr, local frame, n = +z.
-    Raises UsageError for another slot, FileError where it cannot be read, InputError where it is not such a file.
+    An NDF is `real ndf_STEM_D(real cos_m, real p1, …)`, STEM the file's stem, at any scale, since the engine normalizes
+    it; a second parameter `sin2_m` gets sin²θ. A BRDF is `real3 brdf_STEM_f(real3 l, real3 v, …)` in 1/sr, in the local
+    frame with n = +z. Raises UsageError for another slot, FileError where the file cannot be read, and InputError where
+    it does not define such a function.
     """
     path = Path(path)
     if slot not in FORMS:

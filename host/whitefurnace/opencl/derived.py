@@ -1,4 +1,4 @@
-"""Numbers that follow from a model's parameters: constants, a user's norm and width, the table of Smith's area."""
+"""Numbers that kernels need beside a model's parameters: constants, a user's norm, tables of Smith's area."""
 from __future__ import annotations
 
 import math
@@ -29,8 +29,11 @@ by 5 % from one to the next."""
 
 @dataclass(frozen=True)
 class AreaTable:
-    """Smith's area of several NDFs as kernels read it: `rows` (3 + length, n) are scale, 1/range, A(0) and `length`
-    terms; `error` is that of A relative to A."""
+    """A table of Smith's projected area of several NDFs, as kernels read it.
+
+    rows: (3 + length, n) scale, 1/range, A(0) and `length` terms of a series, one column an NDF. error: the error of
+    the area relative to the area.
+    """
 
     rows: np.ndarray
     length: int
@@ -38,7 +41,7 @@ class AreaTable:
 
 
 def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct columns of (k, n) as (k, m), and for each of the n which of them it is."""
+    """Return the distinct columns of (k, n) numbers as (k, m), and for each of the n columns the index of its own."""
     if rows.shape[1] == 0 or rows.shape[0] == 0 or (rows == rows[:, :1]).all():
         return rows[:, :1], np.zeros(rows.shape[1], np.intp)
     # Grids come in runs of equal columns: sorting their heads alone is many times quicker.
@@ -48,9 +51,10 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def numbers_of(device: Device, entry: Model, rows: np.ndarray) -> np.ndarray:
-    """Parameters (k, n) float64 -> parameters and constants (k + c, n), as kernels read them.
+    """Return the numbers that kernels take of a model: parameters and constants, (k + c, n) float64.
 
-    Raises InputError for a user's NDF that cannot be normalized.
+    rows: the parameters, (k, n) float64, one column a cell. Raises InputError for a user's NDF that cannot be
+    normalized.
     """
     if not entry.constant_names:
         return rows
@@ -66,7 +70,7 @@ def numbers_of(device: Device, entry: Model, rows: np.ndarray) -> np.ndarray:
 
 
 def finest(device: Device) -> int:
-    """The precision in which tables and norms are made."""
+    """Return the precision, 32 or 64, in which tables and norms are made: the finest that the device has."""
     return 64 if device.fp64 else 32
 
 
@@ -99,23 +103,23 @@ def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.nd
 
 
 def refuse_bad(entry: Model, D: np.ndarray, theta: np.ndarray) -> None:
-    """InputError for a D that is NaN, infinite or negative somewhere."""
+    """Raise InputError where a user's D is NaN, infinite or negative at one of the angles theta, in radians."""
     for bad, what in ((~np.isfinite(D), "not finite"), (D < 0, "negative")):
         if bad.any():
             raise InputError(f"{entry.path}: cannot be normalized: D is {what} at θ = {theta[bad.argmax()]:.4g} rad")
 
 
 class Areas:
-    """Tables of Smith's area, made once for each parameter set."""
+    """Makes the tables of Smith's area of one NDF, once for each set of parameters."""
 
     def __init__(self, device: Device, entry: Model, precision: int) -> None:
         self.device, self.entry, self.precision = device, entry, precision
         self._made: dict[bytes, tuple[np.ndarray, float]] = {}
 
     def table(self, rows: np.ndarray, tolerance: float = 0.0) -> AreaTable:
-        """The table for cells of numbers (k, n), with as many terms as a tenth of `tolerance` needs.
+        """Return the table for cells of numbers (k, n), with as many terms as a tenth of `tolerance` needs.
 
-        Raises UnsupportedError where A is infinite: D grows like 1/cos θ at grazing or faster.
+        Raises UnsupportedError where the area is infinite: D grows like 1/cos θ at grazing or faster.
         """
         distinct, which = unique_rows(rows)
         keys = [distinct[:, k].tobytes() for k in range(distinct.shape[1])]
@@ -176,8 +180,11 @@ class Areas:
 
 
 def lobe_norm(device: Device, entry: Model, parameters: Mapping[str, float]) -> float:
-    """∫ K dω of the prefilter's lobe K = D(h)(n·l), to rounding: from the entry's reference, by Gauss panels in the log
-    of s = 1 - l·r; of a user's NDF on the device (catalogue.registry.LOBE)."""
+    """Return ∫ K dω of the prefilter's lobe K = D(h)(n·l) with n = v = r, to rounding.
+
+    For a model of the catalogue it is summed from the entry's reference, by Gauss panels in the logarithm of s = 1 -
+    l·r; for a user's NDF on the device (`catalogue.registry.LOBE`).
+    """
     if entry.reference:
         edges = np.concatenate([[0.0], np.geomspace(1e-14, 1.0, 57)])
         x, w = gauss(12)
@@ -191,7 +198,7 @@ def lobe_norm(device: Device, entry: Model, parameters: Mapping[str, float]) -> 
 
 
 def at_horizon(device: Device, entry: Model, parameters: Mapping[str, float]) -> float:
-    """D(45°), the slope of the lobe where l sets."""
+    """Return D at 45°, which is the slope of the prefilter's lobe at the horizon."""
     if entry.reference:
         return float(entry.reference["D"](np.float64(math.pi / 4), **parameters))
     cells = np.concatenate([np.array([[math.sqrt(0.5)], [0.5]]), numbers_of(device, entry, _row(entry, parameters))])
@@ -203,7 +210,10 @@ def _row(entry: Model, parameters: Mapping[str, float]) -> np.ndarray:
 
 
 def density_at(device: Device, entry: Model, parameters: Mapping[str, float], q: np.ndarray) -> np.ndarray:
-    """D, (n,) float64, at q = |l - r|² where n = v = r: sin²θ_h = q/4. q: (n,) in [0, 2]."""
+    """Return D, (n,) float64, at the half vectors of directions l with q = |l - r|², where n = v = r.
+
+    q: (n,) in [0, 2]. The half vector has sin²θ = q/4.
+    """
     if entry.reference:
         return np.asarray(entry.reference["D"](np.arcsin(np.sqrt(q / 4)), **parameters), np.float64)
     numbers = numbers_of(device, entry, _row(entry, parameters))

@@ -1,4 +1,4 @@
-"""The only door to OpenCL: finds the devices that really work, chooses one, builds kernels and runs them."""
+"""Finds the OpenCL devices that really work, chooses one, builds kernels and runs them: the only door to pyopencl."""
 from __future__ import annotations
 
 import atexit
@@ -30,7 +30,7 @@ INSTALL = (
 
 
 class Tuning(NamedTuple):
-    """How a kind of device likes its work: measured on AVX-512 CPUs, elsewhere safe."""
+    """The sizes of launches that a kind of device runs fastest with: measured on AVX-512 CPUs, safe elsewhere."""
 
     vectors: int  # T: vectors of W lanes a work item
     local_size: int  # work items a group
@@ -59,10 +59,10 @@ QUEUE_DEPTH = 8
 
 @dataclass(frozen=True)
 class Candidate:
-    """A listed OpenCL device, and whether it works.
+    """An OpenCL device of the list, and whether it works.
 
-    `index` counts from the most preferred device; `verdict` is "works" or one line why not; `fp64` tells
-    whether float64 works too.
+    index: its place, counted from the most preferred device. name, platform, driver: the driver's words. type: "gpu",
+    "cpu" or "other". verdict: "works", or one line that says why not. fp64: whether float64 works too.
     """
 
     index: int
@@ -118,15 +118,16 @@ def _pip_runtimes() -> list[Path]:
 
 
 def cores() -> int:
-    """The logical cores that this process may use."""
+    """Return the number of logical cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def core_limit(count: int) -> dict[str, str]:
-    """The environment in which CPU runtimes use at most `count` cores: for a process that is yet to load them.
+    """Return the environment variables with which CPU runtimes use at most `count` cores, for a new process.
 
-    Sub-devices would be the standard's way, but kernels on one of 1 of 2 units kept both cores busy on PoCL 3.1 and
-    Intel's runtime 2026; with these the CPU time was 0.99 and 1.01 of the wall time. A user's own setting stays.
+    A process that has loaded its runtimes does not read them any more. Sub-devices would be the standard's way, but
+    kernels on one of 1 of 2 units kept both cores busy on PoCL 3.1 and Intel's runtime 2026; with these the CPU time
+    was 0.99 and 1.01 of the wall time. A variable that the user has set is not among them.
     """
     return {name: str(count) for name in CORE_LIMITS if name not in os.environ}
 
@@ -263,9 +264,9 @@ def _try(raw: Any) -> tuple[Device | None, str]:
 
 
 def find_devices() -> list[Candidate]:
-    """Every OpenCL device listed, best first, each tried with a small kernel; empty without OpenCL.
+    """List every OpenCL device, best first, each tried with a small kernel; an empty list without OpenCL.
 
-    Drivers' noise is swallowed and their failures are told in `verdict`. Raises only UsageError, for a
+    What drivers print is swallowed, and a device that fails says why in `verdict`. Raises UsageError for a
     WHITEFURNACE_LANES that is not 1, 4, 8 or 16.
     """
     candidates = []
@@ -280,11 +281,11 @@ def find_devices() -> list[Candidate]:
 
 
 def choose_device(name: str | None = None) -> Device:
-    """The first device, best first, that gives right answers; the same object for the whole process.
+    """Return the first device, best first, that gives right answers; the same object for the whole process.
 
-    `name` is an index as `find_devices` has it or a part of "platform: device" in any case; by default the
-    variable WHITEFURNACE_DEVICE. Only as many devices are tried as it takes. Raises UsageError where nothing
-    is called so and DeviceError where no device works.
+    name: an index of `find_devices` or a part of "platform: device" in any case; by default the variable
+    WHITEFURNACE_DEVICE. Only as many devices are tried as it takes. Raises UsageError where no device has that name,
+    and DeviceError where none works.
     """
     if name is None:
         name = os.environ.get("WHITEFURNACE_DEVICE") or None
@@ -341,7 +342,7 @@ class Buffer:
         self._shared = shared  # the host array whose memory this is; kept alive here
 
     def read(self) -> np.ndarray:
-        """Waits for all launches; a copy, of `shape` and `dtype`. Raises DeviceError if a launch failed."""
+        """Wait for all launches and return a copy, of `shape` and `dtype`. Raises DeviceError if a launch failed."""
         self.device.finish()
         values = np.empty(self.shape, self.dtype)
         if self.nbytes:
@@ -350,7 +351,7 @@ class Buffer:
         return values
 
     def write(self, values: np.ndarray) -> None:
-        """Waits for all launches and copies `values`, of the buffer's shape and dtype, into it.
+        """Wait for all launches and copy `values`, of the buffer's shape and dtype, into it.
 
         Raises ValueError for another shape or dtype and DeviceError if a launch failed.
         """
@@ -392,7 +393,7 @@ class Program:
         self._kernels: dict[str, Kernel] = {}
 
     def kernel(self, name: str) -> Kernel:
-        """The kernel called `name`, the same object every time. Raises DeviceError where there is none."""
+        """Return the kernel called `name`, the same object every time. Raises DeviceError where there is none."""
         if name not in self._kernels:
             with _translated(self.device, f"kernel {name}"):
                 raw = _opencl().Kernel(self._raw, name)
@@ -423,14 +424,16 @@ def _define(name: str, value: int | float | str) -> str:
 
 
 class Device:
-    """An OpenCL device with an in-order queue; `choose_device` makes it, and has seen it give a right answer.
+    """An OpenCL device with an in-order queue. `choose_device` makes it after it has seen it give a right answer.
 
-    `name`, `platform`, `driver` and `version` are the driver's words, `type` is "gpu", "cpu" or "other".
-    `vectors` is T, the vectors of W lanes a work item; `local_size` is the work items a group along the first
-    axis, `scalar_size` where items are small and scalar; `orbits` groups of outputs share what `octahedral.cl` reads;
-    `max_allocation` and `global_memory` are in bytes;
-    `seconds` is the time that kernels have run, up to date after `finish` or `Buffer.read`. WHITEFURNACE_LANES
-    (1, 4, 8 or 16) overrides the lanes.
+    name, platform, driver, version: the driver's words. type: "gpu", "cpu" or "other".
+    vectors: T, the vectors of W lanes of one work item.
+    local_size, scalar_size: work items of a group along the first axis; the second where items are small and scalar.
+    orbits: groups of outputs that share what `octahedral.cl` reads.
+    max_allocation, global_memory: bytes.
+    seconds: the time for which kernels have run, up to date after `finish` and `Buffer.read`.
+
+    The variable WHITEFURNACE_LANES (1, 4, 8 or 16) overrides the number of lanes.
     """
 
     def __init__(self, raw: Any) -> None:
@@ -489,9 +492,9 @@ class Device:
         return self._fp64
 
     def lanes(self, precision: int = 32) -> int:
-        """W, the lanes of a vector: for `precision` 32 16, 8 or 4 on a CPU, for 64 half of that; 1 on a GPU.
+        """Return W, the lanes of a vector: on a CPU 16, 8 or 4 for `precision` 32 and half of that for 64; 1 on a GPU.
 
-        Raises UnsupportedError where the device has no (right) float64.
+        Raises UnsupportedError where the device has no float64 that is right.
         """
         if precision == 32:
             return self._lanes
@@ -507,15 +510,15 @@ class Device:
         return _address(self._raw)
 
     def identity(self) -> dict[str, str]:
-        """What a manifest records of the device: name, platform, driver, version, type."""
+        """Return what a manifest records of the device: name, platform, driver, version, type."""
         return {"name": self.name, "platform": self.platform, "driver": self.driver, "version": self.version,
                 "type": self.type}
 
     def build(self, text: str, options: Mapping[str, int | float | str] | None = None) -> Program:
-        """Builds OpenCL C 1.2 `text`, each option a -D; the same program for the same text and options.
+        """Build OpenCL C 1.2 `text` and return the program, the same one for the same text and options.
 
-        Floats are written as Python does, without a suffix. Raises DeviceError with the compiler's
-        first errors.
+        options: names and values, each passed as -D. Floats are written as Python does, without a suffix. Raises
+        DeviceError with the compiler's first errors.
         """
         cl = _opencl()
         # No fast-math: explicit lanes gain nothing by it and compensated sums break under it.
@@ -554,10 +557,10 @@ class Device:
         return Buffer(self, memory, shape, dtype, values if share else None)
 
     def array(self, values: np.ndarray, *, writable: bool = False) -> Buffer:
-        """A buffer that holds `values`, for kernels to read, or to write too where `writable`.
+        """Return a buffer that holds `values`, for kernels to read, and to write too where `writable`.
 
-        On a CPU a contiguous array at an aligned address (`aligned_empty` gives one) is not copied unless
-        `writable`: do not change it while the buffer lives. Raises DeviceError where there is no room.
+        On a CPU a contiguous array at an aligned address (`aligned_empty` gives one) is not copied unless `writable`:
+        do not change it while the buffer lives. Raises DeviceError where there is no room.
         """
         values = np.ascontiguousarray(values).reshape(np.shape(values))
         share = (self.type == "cpu" and not writable and values.nbytes > 0
@@ -565,12 +568,12 @@ class Device:
         return self._allocate(values.shape, values.dtype, values, writable=writable, share=share)
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Buffer:
-        """A buffer of undefined content, to be written and read. Raises DeviceError without room for it."""
+        """Return a buffer of undefined content, for kernels to write. Raises DeviceError without room for it."""
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
         return self._allocate(shape, np.dtype(dtype), None, writable=True, share=False)
 
     def aligned_empty(self, shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
-        """A host array of undefined content, so aligned that `array` need not copy it on a CPU."""
+        """Return a host array of undefined content, so aligned that `array` need not copy it on a CPU."""
         dtype = np.dtype(dtype)
         nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
         raw = np.empty(nbytes + self._alignment, np.uint8)
@@ -579,11 +582,11 @@ class Device:
 
     def launch(self, kernel: Kernel, global_size: tuple[int, ...], args: Sequence[Buffer | np.generic | None],
                local_size: tuple[int, ...] | None = None) -> None:
-        """Enqueues `kernel` over `global_size` work items; nothing is padded.
+        """Enqueue `kernel` over `global_size` work items; nothing is padded.
 
-        `args` are buffers of this device, numpy scalars of the kernel's types, or None for a null pointer.
-        The local size is `(self.local_size, 1, …)` by default, and the first global size a multiple of it.
-        Raises DeviceError where the runtime refuses; a failure while running is raised by a later call.
+        args: buffers of this device, numpy scalars of the kernel's types, or None for a null pointer. local_size: by
+        default `(self.local_size, 1, …)`; the global size must be a multiple of it. Raises DeviceError where the
+        runtime refuses; a failure while running is raised by a later call.
         """
         first, *rest = local_size or (self.local_size, *(1,) * (len(global_size) - 1))
         while first > max(kernel.work_group_limit, 1):  # halves still divide a padded global size
@@ -612,7 +615,7 @@ class Device:
             count -= 1
 
     def finish(self) -> None:
-        """Waits until all launches are done. Raises DeviceError where one failed."""
+        """Wait until all launches are done. Raises DeviceError where one failed."""
         with self._lock, _translated(self, "running a kernel"):
             self._settle(len(self._pending))
             self._queue.finish()

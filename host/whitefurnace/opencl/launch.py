@@ -1,4 +1,4 @@
-"""Launches over cells: rows of numbers, one cell a lane, in blocks of bounded size."""
+"""Launches of kernels over cells: rows of numbers, one cell a lane, in blocks of bounded size."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -15,9 +15,11 @@ CELLS_A_LAUNCH = 1 << 16
 
 def over_cells(device: Device, text: str, kernel: str, cells: np.ndarray, components: int, precision: int,
                between: Sequence[np.generic | np.ndarray] = ()) -> np.ndarray:
-    """(components, n) of a kernel over cells (rows, n) float64; `between` are its arguments from `cells` to the rows.
+    """Run a kernel over cells and return its values, (components, n), in the working precision.
 
-    Arrays among them are sent in the working precision. Lanes past the end repeat the last cell.
+    cells: (rows, n) float64, one column a cell. components: numbers that the kernel writes for each cell. precision: 32
+    or 64. between: the arguments of the kernel from the number of cells to the cells; arrays among them are sent in the
+    working precision. Lanes past the end repeat the last cell.
     """
     kind = np.dtype(f"f{precision // 8}")
     lanes = device.lanes(precision)
@@ -38,7 +40,10 @@ def over_cells(device: Device, text: str, kernel: str, cells: np.ndarray, compon
 
 def over_nodes(device: Device, text: str, kernel: str, cells: np.ndarray, components: int, precision: int,
                rule: Rule, azimuths: bool = True) -> np.ndarray:
-    """`over_cells` for a kernel that sums over the nodes of a rule."""
+    """Run a kernel that sums over the nodes of a quadrature rule: `over_cells` with the rule's tables between.
+
+    azimuths: whether the kernel takes the nodes of the azimuth too.
+    """
     polar, azimuthal = rule.tables()
     between: list[np.generic | np.ndarray] = [*map(np.int32, rule.counts), polar]
     if azimuths:
@@ -48,10 +53,11 @@ def over_nodes(device: Device, text: str, kernel: str, cells: np.ndarray, compon
 
 def evaluate(device: Device, function: str, slots: Mapping[str, Model], cells: np.ndarray,
              precision: int, area_terms: int = 0) -> np.ndarray:
-    """(components, n): a model function (`NDF_D`, `FRESNEL_F`, …) at its own arguments and the models' numbers.
+    """Evaluate a function of a model at its own arguments on the device: (components, n).
 
-    cells: (rows, n), the arguments first (three rows for a vector), then parameters and constants of each slot, then
-    the table of Smith's area of `area_terms` terms where the masking reads one.
+    function: its name as kernels call it (`NDF_D`, `FRESNEL_F`, …). slots: the models of the program. cells: (rows, n),
+    the function's arguments first (three rows for a vector), then the parameters and constants of each slot, then the
+    table of Smith's area of `area_terms` terms where the masking reads one. precision: 32 or 64.
     """
     components = 3 if function == "BRDF_F" else 1
     return over_cells(device, source.evaluation(function, slots, area_terms).text, "evaluate", cells, components,
