@@ -1,4 +1,4 @@
-"""Microfacet normals drawn from any NDF: by its own quantile where it has one, else by a table of its energy."""
+"""Draws microfacet normals from any NDF: by its own quantile where it has one, else by a table of its energy."""
 from __future__ import annotations
 
 import math
@@ -20,11 +20,16 @@ e-folds of angle that is wrong by h²/12 ≈ 1e-6 of the density."""
 
 def sample(ndf: str | Model, count: int, *, seed: int = 0, device: Device | str | None = None, precision: int = 32,
            **parameters: float) -> np.ndarray:
-    """`count` normals m with density D(m)(n·m), (count, 3) float64, n = +z.
+    """Draw `count` normals m with density D(m)(n·m): (count, 3) float64, n = +z.
 
-    ndf: a name (`ggx`, `ggx:alpha=.3`), a catalogue entry or the path of a `.clh` file; parameters as in `integrate`,
-    one number each. The same seed gives the same normals. NDFs with a closed quantile are sampled by it on the device
-    in `precision`, the others through a table of their energy. Raises as `integrate` does.
+    ndf: a name (`ggx`, `ggx:alpha=.3`), a catalogue entry or the path of a `.clh` file.
+    count: how many, 1 to 2^28.
+    seed: the same seed gives the same normals.
+    device, precision: NDFs with a closed quantile are sampled by it on the device in float32 or float64, the others
+      through a table of their energy.
+    parameters: those of the NDF, one number each.
+
+    Raises what `integrate` raises.
     """
     choice = chosen("ndf", ndf)
     entry = choice.model
@@ -60,8 +65,10 @@ def sample(ndf: str | Model, count: int, *, seed: int = 0, device: Device | str 
 
 
 def quantiles(device: Device, entry: Model, numbers: np.ndarray, u: np.ndarray, precision: int = 32) -> np.ndarray:
-    """(n,) float64: sin²θ at the quantiles u of an isotropic NDF's density D(m)(n·m); `numbers` (k, 1) as kernels take
-    them."""
+    """Return sin²θ, (n,) float64, at the quantiles u of an isotropic NDF's density D(m)(n·m).
+
+    numbers: (k, 1) parameters and constants as kernels take them. u: (n,) in [0, 1).
+    """
     if "NDF_SAMPLE" in entry.provides:
         return _closed(device, entry, u, numbers, precision)
     return np.asarray(np.sin(np.interp(u, *_energy(device, entry, numbers))) ** 2)

@@ -1,5 +1,8 @@
-"""The outline of an area light as a surface sees it: pieces of P(t) = C + A cos t + B sin t above the horizon, cut into
-panels that are graded where an integral along them has its short scales. Float64; `radiance_outline.cl` sums them."""
+"""The outline of an area light as a surface sees it, cut into panels for quadrature.
+
+A piece is P(t) = C + A cos t + B sin t above the horizon. Panels are graded where an integral along them has its short
+scales. Float64; `radiance_outline.cl` sums them.
+"""
 from __future__ import annotations
 
 import math
@@ -21,8 +24,10 @@ HORIZON = 1e-3
 
 @dataclass(frozen=True)
 class Pieces:
-    """(n, 3) vectors C, A, B of n pieces, their ends in t (n,), the light on the left as azimuths run, and the cell
-    each belongs to."""
+    """Pieces of outlines: vectors C, A, B (n, 3), their ends in t (n,), and the cell that each belongs to.
+
+    The light is on the left as azimuths run.
+    """
 
     C: np.ndarray
     A: np.ndarray
@@ -32,7 +37,7 @@ class Pieces:
     cell: np.ndarray
 
     def at(self, t: np.ndarray) -> np.ndarray:
-        """(..., n, 3) points at t (..., n)."""
+        """Return the points at t (..., n): (..., n, 3)."""
         return self.C + self.A * np.cos(t)[..., None] + self.B * np.sin(t)[..., None]
 
 
@@ -114,7 +119,10 @@ def _disc(center: np.ndarray, normal: np.ndarray, radius: np.ndarray) -> Pieces:
 
 
 def outline(light: str, numbers: Mapping[str, np.ndarray]) -> Pieces:
-    """The pieces of the light's outline for cells of parameters (n,); none where it shines away or is below."""
+    """Return the pieces of a light's outline for cells of parameters (n,) by name.
+
+    light: "disc" or "rectangle". There are none where the light shines away or is below the horizon.
+    """
     def vector(name: str) -> np.ndarray:
         return np.stack([numbers[f"{name}_{axis}"] for axis in "xyz"], -1)
 
@@ -181,10 +189,10 @@ def _crossing(pieces: Pieces, direction: np.ndarray, level: np.ndarray | float =
 
 def panels(pieces: Pieces, NoV: np.ndarray, phi: np.ndarray,
            widths: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Rows (11, m) of panels, as `source.OUTLINE` names them, and the cell of each, sorted.
+    """Return rows (11, m) of panels, as `source.OUTLINE` names them, and the cell of each, sorted.
 
-    NoV, phi, widths: of the cells; widths (n, 2) of the lobe along x and y, None for a diffuse model, whose kinks lie
-    across the view's azimuth and at its polar angle.
+    NoV, phi: the views of the cells, (n,). widths: (n, 2) of the lobe along x and y; None for a diffuse model, whose
+    kinks lie across the view's azimuth and at its polar angle.
     """
     if not len(pieces.cell):
         return np.empty((11, 0)), np.empty(0, int)

@@ -1,4 +1,4 @@
-"""Plan -> numbers: runs an integral of the catalogue over a grid of parameters, with its error estimate."""
+"""Computes an integral of the catalogue over a grid of parameters, with an estimate of its error."""
 from __future__ import annotations
 
 import time
@@ -48,24 +48,9 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
               precision: int = 32, tolerance: float | None = None, backfacing: str | None = None,
               device: Device | str | None = None, out: np.ndarray | None = None, progress: Progress | None = None,
               **parameters: Any) -> Integrated:
-    """Integrates `name` of the catalogue over all broadcast `parameters`.
+    """Integrate a BRDF over all broadcast `parameters`; `whitefurnace.integrate` documents the arguments.
 
-    name: normalization, projected_area, weak_furnace, albedo, albedo_average or dfg.
-    ndf, masking, fresnel, diffuse: names (`ggx`, `ggx:alpha=.3`, `schlick:gold`), catalogue entries, or for an NDF the
-        path of a `.clh` file. With a diffuse model, albedos are those of the sum; without an NDF, of it alone.
-    brdf: the path of a `.clh` file with a whole BRDF, for albedo and albedo_average, which then have RGB.
-    parameters: `NoV` (cosine in [0, 1]; `phi`, its azimuth in radians, for anisotropic models) where the integral has
-        a view, and the models' own (`alpha`, `f0`): an unqualified name sets it in every slot that has it,
-        `ndf_alpha` in one. They broadcast like numpy arrays; a preset or value with RGB adds a last axis of 3.
-    precision: 32 or 64. tolerance: absolute, default 1e-6 or 1e-12; two rules are compared, and the finer
-        one's values kept where they agree within it (or at the end of the ladder, with the error stated). Cells that
-        float32 cannot do are done in float64, with a notice.
-    backfacing: what to do with views behind the surface, NoV < 0: "clamp" to 0 or "absolute"; refused by default.
-    out: an array for the values, such as a memory map: a grid of any size then needs little memory of its own.
-    progress: called with the share done after each part of 65536 cells.
-
-    Raises UsageError for unknown names and values outside their domain, UnsupportedError for a combination
-    that no rule serves, DeviceError where no device works.
+    name: any integral but radiance. Raises what `whitefurnace.integrate` raises.
     """
     start = time.perf_counter()
     if precision not in (32, 64):
@@ -101,7 +86,7 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
 
 
 def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
-    """A notice where the tolerance is missed by more than the rounding of a value of 1 and as much again."""
+    """Yield a notice where the tolerance is missed by more than the rounding of a value of 1 and as much again."""
     if not error <= 2 * max(tolerance, ROUNDING[precision]):
         yield f"the error of {error:.2g} is over the tolerance of {tolerance:g}: the finest rule did not reach it"
 
@@ -121,8 +106,11 @@ def _of_files(parts: Sequence[Part], flat: np.ndarray) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class TableSpec:
-    """What `integrate` would compute with the same arguments: the models by slot, the shape of `values` and the digests
-    of the kernels. `precision`, `tolerance`, `device`, `out` and `progress` do not change it."""
+    """What `integrate` would compute with the same arguments.
+
+    entry, slots: the integral and the models by slot. shape: that of `values`. digests: those of the kernels.
+    `precision`, `tolerance`, `device`, `out` and `progress` do not change it.
+    """
 
     entry: Integral
     slots: Mapping[str, Chosen]
@@ -133,7 +121,10 @@ class TableSpec:
 def table_spec(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
                diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
                **parameters: Any) -> TableSpec:
-    """The arguments of `integrate` checked, without a device. Raises what `integrate` raises of them."""
+    """Check the arguments of `integrate` without a device, and return what it would compute.
+
+    Raises what `integrate` raises for its arguments.
+    """
     entry = integral(name)
     _refuse_lit(entry)
     slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
@@ -147,7 +138,7 @@ def table_spec(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", f
 
 
 def room_for(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.ndarray:
-    """The array for the values: `out`, or a new one."""
+    """Return the array for the values: `out`, or a new one. Raises UsageError where `out` does not fit."""
     if out is None:
         return np.empty(shape, np.dtype(f"f{precision // 8}"))
     if out.shape != shape or not out.flags.c_contiguous or out.dtype.kind != "f":
@@ -165,7 +156,10 @@ def _refuse_lit(entry: Integral) -> None:
 
 def slots_of(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
            diffuse: Spec | None, brdf: Spec | None) -> dict[str, Chosen]:
-    """The slots an integral needs, filled; a slot it does not need is not compiled in."""
+    """Return the models of the slots that an integral needs. A slot that it does not need is not compiled in.
+
+    Raises UsageError and UnsupportedError for models that do not go together or that the integral has no use for.
+    """
     albedo = entry.name in ("albedo", "albedo_average", "radiance")
     if not albedo and (diffuse is not None or brdf is not None):
         raise UnsupportedError(f"integral {entry.name} is of an NDF; a diffuse model or a BRDF has albedo, "
@@ -194,7 +188,10 @@ def slots_of(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
 
 @dataclass(frozen=True)
 class Grid:
-    """Broadcast columns by (slot, parameter) or name, read in parts: nothing of the grid's size is made."""
+    """Broadcast columns of numbers by name (`NoV`, `ndf_alpha`), read in parts: no array of the grid's size is made.
+
+    shape: the broadcast shape. rgb: whether the last axis is that of the channels.
+    """
 
     shape: tuple[int, ...]
     columns: Mapping[str, np.ndarray]
@@ -202,22 +199,27 @@ class Grid:
 
     @property
     def size(self) -> int:
+        """Number of cells."""
         return int(np.prod(self.shape, dtype=np.int64))
 
     def part(self, name: str, begin: int, end: int) -> np.ndarray:
-        """Cells [begin, end) of a column, float64."""
+        """Return cells [begin, end) of a column, float64."""
         column = self.columns[name]
         return np.full(end - begin, float(column)) if column.ndim == 0 else np.asarray(
             np.broadcast_to(column, self.shape).flat[begin:end], np.float64)
 
     def rows(self, part: Part, begin: int, end: int) -> np.ndarray:
-        """The parameter rows of one part of the BRDF, view first: (rows, end - begin)."""
+        """Return the parameter rows of one part of the BRDF for cells [begin, end), view first: (rows, end - begin)."""
         names = [*part.view, *(f"{slot}_{p.name}" for slot, m in part.slots.items() for p in m.parameters)]
         return np.stack([self.part(name, begin, end) for name in names])
 
 
 def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], backfacing: str | None) -> Grid:
-    """Every number the kernels need, checked against its domain, and the broadcast shape."""
+    """Return every number that the kernels need, checked against its domain, with the broadcast shape.
+
+    given: the parameters by name; those used are taken out. Raises UsageError for numbers outside their domain, unknown
+    or missing names, and shapes that do not broadcast.
+    """
     columns: dict[str, Any] = {}
     rgb: set[str] = set()
     isotropic = (all(choice.model.isotropic for choice in slots.values()) and "brdf" not in slots
@@ -297,7 +299,11 @@ def _view(given: Any, backfacing: str | None) -> np.ndarray:
 
 @dataclass
 class Part:
-    """One summand of the BRDF on a device: the specular one, the diffuse one or a user's whole one."""
+    """One summand of the BRDF on a device: the specular one, the diffuse one or a user's whole one.
+
+    closed: the file of a kernel that it has of its own. areas: tables of Smith's area by precision. norms: the least
+    and the largest norm of a user's NDF so far.
+    """
 
     device: Device
     entry: Integral
@@ -309,6 +315,7 @@ class Part:
 
     @property
     def kind(self) -> str:
+        """The family of rules that it is integrated by: a key of `LADDERS`."""
         if self.closed:
             return "light-angles"
         if "ndf" in self.slots:
@@ -319,10 +326,12 @@ class Part:
 
     @property
     def view(self) -> tuple[str, ...]:
+        """Names of the numbers that describe the view, the first rows of a cell."""
         return ("NoV",) if self.kind in ("gauss", "polar", "hemisphere", "light-angles") else ("NoV", "phi")
 
     @property
     def components(self) -> int:
+        """Numbers of one value."""
         return 3 if self.kind == "half-vectors" else self.entry.components
 
     @property
@@ -332,7 +341,10 @@ class Part:
         return "NDF_AREA" in needs and "NDF_AREA" not in self.slots["ndf"].provides
 
     def cells(self, rows: np.ndarray, precision: int, tolerance: float = 0.0) -> tuple[np.ndarray, int, float]:
-        """Rows of view and parameters -> rows as kernels read them, the length of the area's table, its error."""
+        """Return rows as kernels read them, the length of the table of Smith's area, and the error of that table.
+
+        rows: view and parameters, (k, n) float64. tolerance: what the table may be off by, ten times.
+        """
         count = len(self.view)
         read, out, ndf = count, [rows[:count]], None
         for entry in self.slots.values():
@@ -357,17 +369,20 @@ class Part:
 
     @property
     def ladder(self) -> tuple[Rule, ...]:
+        """The rules that the integral climbs, from the coarsest."""
         return LADDERS[self.kind]
 
     def lanes(self, cells: np.ndarray) -> int:
-        """How many integrals the kernel sums for these cells."""
+        """Return how many integrals the kernel sums for these cells."""
         return cells.shape[1]
 
     def text(self, terms: int) -> str:
+        """Return the kernel text, with a table of Smith's area of `terms` terms."""
         return (source.closed(self.closed, self.slots) if self.closed else
                 _program(self.entry, self.slots, terms)).text
 
     def sum(self, cells: np.ndarray, terms: int, rule: Rule, precision: int) -> np.ndarray:
+        """Return the sums of one rule over cells: (components, n) in the working precision."""
         return over_nodes(self.device, self.text(terms), "integrate", cells, self.components, precision, rule)
 
 
@@ -379,7 +394,7 @@ def _program(entry: Integral, slots: Mapping[str, Model], terms: int) -> source.
 
 
 def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
-    """The kernel that an integral has of its own for these models, if it has one."""
+    """Return the kernel file that an integral has of its own for these models, or None."""
     if "ndf" not in slots or any(m.text is not None for m in slots.values()):
         return None
     names = [m.name for m in slots.values()]
@@ -387,20 +402,24 @@ def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
 
 
 def summands_of(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
-    """The models of each summand of the BRDF: the specular one, the diffuse one or a user's whole one."""
+    """Return the models of each summand of the BRDF: the specular one, the diffuse one or a user's whole one."""
     specular = {slot: c.model for slot, c in slots.items() if slot in ("ndf", "masking", "fresnel")}
     return [some for some in (specular, *({slot: slots[slot].model} for slot in ("diffuse", "brdf") if slot in slots))
             if some]
 
 
 def parts_of(device: Device, entry: Integral, slots: Mapping[str, Chosen], precision: int) -> list[Part]:
+    """Return the parts of a BRDF on a device, one for each summand."""
     return [Part(device, entry, some, precision) for some in summands_of(slots)]
 
 
 @dataclass
 class Totals:
-    """Totals of a run: its largest estimated error, its evaluations of the integrand, the finest rule that it used, and
-    the number of cells promoted to float64."""
+    """Totals of a run.
+
+    error: the largest estimated error. evaluations: evaluations of the integrand. rule: the finest rule used. promoted:
+    cells that were done in float64 after float32 missed the tolerance.
+    """
 
     error: float = 0.0
     evaluations: int = 0
@@ -408,18 +427,24 @@ class Totals:
     promoted: int = 0
 
     def used(self, rule: Rule, cells: int) -> None:
+        """Count one launch of `rule` over `cells` cells."""
         self.evaluations += rule.evaluations * cells
         if self.rule is None or rule.evaluations > self.rule.evaluations:
             self.rule = rule
 
     def notices(self) -> tuple[str, ...]:
+        """Return the sentence about promoted cells, where there are any."""
         return (f"{self.promoted} cells were done in float64: float32 did not reach the tolerance there",) \
             if self.promoted else ()
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
 def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precision: int | None = None) -> np.ndarray:
-    """(components, n): climbs the ladder, every block of cells until two neighbouring rules agree on it."""
+    """Integrate cells by finer and finer rules until two neighbouring ones agree: (components, n).
+
+    Every block of cells goes on until it agrees within `tolerance`; `totals` takes note of error and work. Raises
+    CheckError where values are not finite.
+    """
     precision = precision or part.precision
     ladder = part.ladder
     cells, terms, floor = part.cells(rows, precision, tolerance)
@@ -529,10 +554,14 @@ def _slices(begin: int, end: int, step: int) -> Iterator[tuple[int, int]]:
 
 def dfg(size: int = 128, *, ndf: Spec = "ggx", masking: Spec = "smith",
         tolerance: float = 5e-6, precision: int = 32, device: Device | str | None = None) -> Integrated:
-    """The split-sum table: `values` (size, size, 2), float32 or float64 by `precision`, as [y, x, (scale, bias)].
+    """Compute the split-sum table of a specular BRDF: `values` (size, size, 2) as [y, x, (scale, bias)].
 
-    x is n·v = (x + ½)/size, y perceptual roughness r = (y + ½)/size, row 0 smoothest, α = r². E(v; F0) =
-    F0·scale + bias for Schlick's Fresnel with F90 = 1. Raises as `integrate` does.
+    size: texels an edge, 1 to 4096. x is n·v = (x + ½)/size, and y is perceptual roughness r = (y + ½)/size, α = r²,
+      with the smoothest in row 0.
+    ndf, masking: models, as in `integrate`. E(v; F0) = F0·scale + bias for Schlick's Fresnel with F90 = 1.
+    tolerance, precision, device: as in `integrate`.
+
+    Raises what `integrate` raises.
     """
     if not 1 <= size <= 4096:
         raise UsageError(f"dfg size {size} is outside [1, 4096]")
@@ -544,8 +573,11 @@ def dfg(size: int = 128, *, ndf: Spec = "ggx", masking: Spec = "smith",
 
 
 def rows_of_roughness(choice: Chosen, r: np.ndarray) -> dict[str, np.ndarray]:
-    """The parameters of a model that follow perceptual roughness, at roughnesses of any shape; those given with it
-    are held and not among them."""
+    """Return the parameters of a model that follow perceptual roughness, by name, at roughnesses of any shape.
+
+    Parameters that were given with the model are held and are not among them. Raises UnsupportedError for a model
+    without any that follows roughness.
+    """
     entry = choice.model
     if entry.from_roughness is None:
         raise UnsupportedError(f"{entry.slot} {entry.name} has no parameter that follows roughness")

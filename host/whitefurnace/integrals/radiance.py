@@ -1,5 +1,7 @@
-"""The full reflectance integral L_o(v) = ∫ f(l, v) L(l)(n·l) dω [Hoffman2012, "The Reflectance Equation"] of a BRDF
-against a light or the texels of an environment, with its error estimate."""
+"""Reflected radiance L_o(v) = ∫ f(l, v) L(l)(n·l) dω of a BRDF under a light or an environment, with its error.
+
+[Hoffman2012, "The Reflectance Equation"]
+"""
 from __future__ import annotations
 
 import math
@@ -78,10 +80,7 @@ def radiance(*, light: Spec | None = None, environment: Any = None, normal: Sequ
              precision: int = 32, tolerance: float | None = None, backfacing: str | None = None,
              device: Device | str | None = None, out: np.ndarray | None = None, progress: Progress | None = None,
              **parameters: Any) -> Integrated:
-    """Reflected radiance; `whitefurnace.integrate` says what it takes and gives.
-
-    Raises as `run.integrate` does, and for an environment what `environments.environment` raises.
-    """
+    """Compute reflected radiance; `whitefurnace.integrate` documents arguments, values and errors."""
     start = time.perf_counter()
     if precision not in (32, 64):
         raise UsageError(f"precision {precision} is not one of 32, 64")
@@ -128,7 +127,7 @@ def _chosen(light: Spec | None, ndf: Spec | None, masking: Spec, fresnel: Spec, 
 def radiance_spec(*, light: Spec | None, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
                   diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
                   **parameters: Any) -> TableSpec:
-    """What `radiance` would compute, as `table_spec` for other integrals; without a light, for an environment."""
+    """Return what `radiance` would compute with the same arguments; without a light, for an environment."""
     entry, slots = integral("radiance"), _chosen(light, ndf, masking, fresnel, diffuse, brdf)
     shape = grid_of(entry, slots, dict(parameters), backfacing).shape
     return TableSpec(entry, slots, (*shape, 3) if light is None or "brdf" in slots else shape, (source.everything(),))
@@ -172,23 +171,25 @@ class _Task:
     parts: dict[str, list[Part]] = field(default_factory=dict)
 
     def column(self, name: str, begin: int, end: int) -> np.ndarray:
+        """Return cells [begin, end) of a column."""
         return self.grid.part(name, begin, end)
 
     def light(self, begin: int, end: int) -> dict[str, np.ndarray]:
-        """The light's parameters, (end - begin,) each."""
+        """Return the parameters of the light by name, (end - begin,) each."""
         return {p.name: self.column(f"light_{p.name}", begin, end) for p in self.slots["light"].model.parameters}
 
     def view(self, begin: int, end: int) -> np.ndarray:
-        """(3, n) directions to the viewer; grazing ones in the limit."""
+        """Return unit directions to the viewer, (3, n); those at grazing are taken to the limit."""
         NoV, phi = np.maximum(self.column("NoV", begin, end), source.LEAST_COSINE), self.column("phi", begin, end)
         sine = np.sqrt((1 - NoV) * (1 + NoV))
         return np.stack([sine * np.cos(phi), sine * np.sin(phi), NoV])
 
     def state(self, summand: str, error: float) -> None:
-        """Takes note of an error: the largest of a summand counts, and those of different summands add up."""
+        """Take note of an error: the largest of a summand counts, and those of different summands add up."""
         self.errors[summand] = max(self.errors.get(summand, 0.0), error)
 
     def result(self, values: np.ndarray, start: float) -> Integrated:
+        """Return the values with the error and the work so far; `start` is the clock's time at the beginning."""
         rule = self.totals.rule.name if self.totals.rule else self.rule
         # What is left of float32 is the rounding of the values themselves.
         rounding = float(np.abs(values).max()) * (6e-8 if self.precision == 32 else 1e-15)
@@ -435,8 +436,11 @@ def _environment_of(task: _Task, given: Any, normal: Sequence[float] | None, rot
 
 
 def frame_of(normal: Sequence[float]) -> np.ndarray:
-    """(3, 3): rows are the local x, y, z in the world. z is the normal; x and y are +X and -Z, turned as +Y turns to
-    the normal on the shortest way (about +X, where that is to -Y)."""
+    """Return the frame of a surface with this normal in the world: (3, 3), rows are the local x, y, z.
+
+    z is the normal; x and y are +X and -Z, turned as +Y turns to the normal on the shortest way (about +X where that is
+    to -Y).
+    """
     try:
         n = np.asarray(normal, np.float64)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""Checks of models, derived from what their catalogue entries declare: one row a check, with its worst cell."""
+"""Checks of models, derived from what their catalogue entries state: one row a check, with its worst cell."""
 from __future__ import annotations
 
 import math
@@ -60,11 +60,15 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Row:
-    """One check of a model: of all its cells the worst, that whose error takes most of its tolerance.
+    """One check of a model, by the worst of all its cells: the one whose error takes most of its tolerance.
 
-    `parameters` is where that is. `error` is |value - expected|, but where `expected` is a bound what exceeds it;
-    `tolerance` is absolute as they are, None for what is measured only. `counterexample` repeats a failed cell with its
-    directions.
+    slot, model, check, precision: what was checked.
+    parameters: those of the worst cell.
+    value, expected, error, tolerance: of that cell. `error` is |value - expected|, or where `expected` is a bound, by
+      how much the value exceeds it. `tolerance` is absolute; it is None for what is only measured.
+    passed, cells: the verdict, and how many cells there were.
+    note: a remark for readers.
+    counterexample: repeats a failed cell with its directions.
     """
 
     slot: str
@@ -84,7 +88,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Subject:
-    """A model and the parameters it is verified at; those not `given` run over their domain."""
+    """A model and the parameters that it is verified at. Those that are not `given` run over their domain."""
 
     model: Model
     label: str
@@ -95,7 +99,7 @@ class Subject:
 
 
 def subjects(specs: Sequence[str]) -> list[Subject]:
-    """The models of `specs` (`ggx`, `ggx:alpha=.3`, `FILE.clh:p=v`), every entry of the catalogue for none.
+    """Return the models of `specs` (`ggx`, `ggx:alpha=.3`, `FILE.clh:p=v`), or every entry of the catalogue for none.
 
     Raises UsageError for an unknown name, with the nearest, and for parameters that a file leaves open.
     """
@@ -142,7 +146,7 @@ def _of_file(slot: str, path: str, spec: str) -> Subject:
 
 def verify(asked: Sequence[Subject], precisions: Iterable[int], device: Device,
            progress: Progress | None = None) -> Iterator[Row]:
-    """All checks of every subject in each precision, one after the other.
+    """Run all checks of every subject in each precision, one after the other, and yield their rows.
 
     Raises UnsupportedError for float64 on a device without it, and what a user's file is refused for.
     """
@@ -191,15 +195,18 @@ def _drawn(p: Parameter, u: np.ndarray) -> np.ndarray:
 
 
 class Bench:
-    """One model in one precision on one device."""
+    """One model in one precision on one device, with the means to check it."""
 
     def __init__(self, subject: Subject, precision: int, device: Device) -> None:
         self.subject, self.model, self.given = subject, subject.model, subject.given
         self.precision, self.device, self.rounding = precision, device, ROUNDING[precision]
 
     def columns(self, values: Callable[[Parameter], np.ndarray] = _typical, draws: int = 0) -> Columns:
-        """Parameter sets: the product of `values` of each parameter, and `draws` more from all over the domain.
-        What is given stays, RGB as three sets."""
+        """Return sets of parameters by name: the product of `values` of each, and `draws` more from all over the
+        domain.
+
+        What is given stays, RGB as three sets.
+        """
         free = [p for p in self.model.parameters if p.name not in self.given]
         mesh = np.meshgrid(*[values(p) for p in free], indexing="ij")
         columns = {p.name: m.ravel() for p, m in zip(free, mesh, strict=True)}
@@ -216,18 +223,21 @@ class Bench:
         return {p.name: columns[p.name] for p in self.model.parameters}
 
     def tolerance(self, check: str, usual: Mapping[int, float]) -> float:
-        """The tolerance of a check: as usual, unless the entry's `tolerance` has one for float32 and float64."""
+        """Return the tolerance of a check: the entry's own for this precision where it states one, else the usual."""
         declared = self.model.checks.tolerance.get(check)
         return float(usual[self.precision] if declared is None else declared[PRECISIONS.index(self.precision)])
 
     def rounded(self, values: Any) -> Any:
-        """As the kernel reads them, in float64."""
+        """Return values as the kernel reads them, in float64."""
         return np.asarray(values, f"f{self.precision // 8}").astype(np.float64)
 
     def kernel(self, function: str, arguments: Sequence[np.ndarray], columns: Columns,
                under: Mapping[str, Model] | None = None) -> np.ndarray:
-        """(components, n) float64 of a model function at its own `arguments` and the parameters in `columns`; `under`
-        are models of other slots that its text wants, at any parameters, since the function does not read them."""
+        """Evaluate a model function on the device: (components, n) float64.
+
+        arguments: the function's own. columns: the parameters by name. under: models of other slots that its text
+        needs; their parameters do not matter, since the function does not read them.
+        """
         slots = {**(under or {}), self.model.slot: self.model}
         rows = []
         count = np.broadcast(*arguments, *columns.values()).size if arguments or columns else 1
@@ -242,7 +252,10 @@ class Bench:
         return evaluate(self.device, function, slots, cells, self.precision).astype(np.float64)
 
     def integral(self, name: str, tolerance: float, **asked: Any) -> tuple[np.ndarray, float, str]:
-        """Values of `integrate`, its error and its notices; NaN everywhere, and the reason, where it gives up."""
+        """Return the values of `integrate`, its error and its notices.
+
+        Where it gives up, values are NaN everywhere and the reason takes the place of the notices.
+        """
         slots: dict[str, Any] = {self.model.slot: self.model}
         try:
             with np.errstate(invalid="ignore", over="ignore"):
@@ -255,7 +268,11 @@ class Bench:
 
     def row(self, check: str, value: Any, expected: Any, tolerance: Any, where: Mapping[str, Any], *,
             bound: str = "", note: str = "") -> Row:
-        """The worst of all cells: of `value` against `expected`, which is equal, or a bound ("most" or "least")."""
+        """Return the row of the worst of all cells of `value` against `expected`.
+
+        where: the parameters and directions of the cells by name. bound: "most" or "least" where `expected` is a bound,
+        empty where it is the exact value.
+        """
         names = list(where)
         shape = np.broadcast_shapes(np.shape(value), np.shape(expected), np.shape(tolerance),
                                     *(np.shape(where[n]) if n not in "lv" else np.shape(where[n])[:-1] for n in names))
@@ -283,8 +300,10 @@ class Bench:
                    note, None if passed else own)
 
     def measured(self, check: str, value: Any, where: Mapping[str, Any], least: bool = False, note: str = "") -> Row:
-        """What is told and not judged: the largest value, or the least. Where all are NaN there is nothing to tell, and
-        the check fails."""
+        """Return the row of a value that is stated and not judged: the largest of all cells, or the least.
+
+        Where all are NaN there is nothing to state, and the check fails.
+        """
         flat = np.asarray(value, np.float64).ravel()
         known = not np.isnan(flat).all()
         k = int(np.nanargmin(flat) if least else np.nanargmax(flat)) if known else 0

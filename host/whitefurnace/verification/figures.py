@@ -1,6 +1,6 @@
 """Figures of models as PNG files: shapes, masking, albedo, Fresnel curves and maps of float32's error.
 
-Every value comes from the device, as users get it, and is held against the float64 reference of the catalogue.
+Every value comes from the device, as users get it, and is compared with the float64 reference of the catalogue.
 """
 from __future__ import annotations
 
@@ -62,10 +62,10 @@ SLOT_TITLES = {"ndf": "NDF", "masking": "Masking", "fresnel": "Fresnel", "diffus
 
 
 def draw(folder: Path, models: Sequence[Model], rows: Sequence[Row], device: Device) -> list[Path]:
-    """One PNG for each model of a slot that has a figure, `folder`/SLOT_NAME.png; the paths, in the models' order.
+    """Draw one PNG, `folder`/SLOT_NAME.png, for each model of a slot that has a figure, and return the paths in order.
 
-    `rows` give each figure its verdict and a user's model its parameters. The same models, rows and device give the
-    same bytes. Raises UnsupportedError without matplotlib, FileError where the folder cannot be written.
+    rows: give each figure its verdict and a user's model its parameters. The same models, rows and device give the same
+    bytes. Raises UnsupportedError without matplotlib, and FileError where the folder cannot be written.
     """
     written: list[Path] = []
     for entry in models:
@@ -83,7 +83,7 @@ def draw(folder: Path, models: Sequence[Model], rows: Sequence[Row], device: Dev
 
 @dataclass(frozen=True)
 class _Sheet:
-    """What a figure is drawn of: its model, with the values to show of each parameter."""
+    """The model of a figure, with the values to show of each parameter."""
 
     figure: Figure
     entry: Model
@@ -91,14 +91,14 @@ class _Sheet:
     device: Device
 
     def usual(self) -> dict[str, Any]:
-        """A telling value of each parameter: a middling one."""
+        """Return a middling value of each parameter."""
         defaults = {p.name: p.default for p in self.entry.parameters if p.default is not None}
         if self.entry.slot == "diffuse":  # white and at its least like Lambert
             return {name: values[-1] for name, values in self.values.items()} | defaults
         return {name: values[len(values) // 2] for name, values in self.values.items()} | defaults
 
     def families(self) -> list[_Family]:
-        """One for each parameter that is worth varying; a single one without a name where there is none."""
+        """Return a family for each parameter that is worth varying; one without a name where there is none."""
         usual = self.usual()
         found = [_Family(p, self.values[p.name], {k: v for k, v in usual.items() if k != p.name})
                  for p in self.entry.parameters if len(self.values[p.name]) > 1]
@@ -107,32 +107,34 @@ class _Sheet:
 
 @dataclass(frozen=True)
 class _Family:
-    """Curves by the values of one parameter, the others held."""
+    """Curves for several values of one parameter, the others held."""
 
     parameter: Parameter | None
     values: tuple[float, ...]
     held: Mapping[str, float]
 
     def numbers(self, values: Any) -> dict[str, Any]:
+        """Return all parameters by name, the varied one at `values`."""
         own = {} if self.parameter is None else {self.parameter.name: values}
         return {**self.held, **own}
 
     def rows(self, values: Any) -> np.ndarray:
-        """(values, x), also of a family without a parameter."""
+        """Return values as (curves, x), also for a family without a parameter."""
         return np.atleast_2d(np.asarray(values, np.float64))
 
     @property
     def columns(self) -> dict[str, Any]:
-        """Parameters with the family along the first of two axes."""
+        """Return the parameters with the family along the first of two axes."""
         return self.numbers(np.array(self.values)[:, None])
 
     def labels(self, entry: Model) -> list[str]:
+        """Return the label of each curve."""
         if self.parameter is None:
             return [self._held(entry) or entry.name]
         return [f"{_symbol(self.parameter)} = {number_label(v)}" for v in self.values]
 
     def caption(self, entry: Model) -> str:
-        """The parameters held, for the legend's head."""
+        """Return the parameters that are held, for the head of the legend."""
         return "" if self.parameter is None else self._held(entry)
 
     def _held(self, entry: Model) -> str:
