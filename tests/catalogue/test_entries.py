@@ -21,7 +21,7 @@ HOST = Path(whitefurnace.__file__).parent
 KERNELS = Path(str(resources.files("whitefurnace.kernels")))
 MODELS = [entry for slot in SLOTS for entry in models(slot).values()]
 EVERY = pytest.mark.parametrize("entry", MODELS, ids=[f"{m.slot}-{m.name}" for m in MODELS])
-KEY = re.compile(r"\[([A-Z][A-Za-z]+\d{4})\b")
+KEY = re.compile(r"(?:\[|; )([A-Z][A-Za-z]+\d{4})\b")
 
 
 @EVERY

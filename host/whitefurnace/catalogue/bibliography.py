@@ -14,6 +14,8 @@ SHARED = {
     "CIE15": "Commission Internationale de l'Éclairage, Colorimetry, 4th edition, CIE 015:2018",
     "ChristensenBurley2015": "P. H. Christensen, B. Burley, Approximate Reflectance Profiles for Efficient Subsurface "
                              "Scattering, Pixar Technical Memo 15-04, 2015",
+    "Cigolle2014": "Z. H. Cigolle, S. Donow, D. Evangelakos, M. Mara, M. McGuire, Q. Meyer, A Survey of Efficient "
+                   "Representations for Independent Unit Vectors, JCGT 3(2), 2014",
     "Clenshaw1955": "C. Clenshaw, A Note on the Summation of Chebyshev Series, MTAC 9(51), 1955",
     "Colbert2007": "M. Colbert, J. Křivánek, GPU-Based Importance Sampling, GPU Gems 3, chapter 20, 2007",
     "dEonLuebke2007": "E. d'Eon, D. Luebke, Advanced Techniques for Realistic Real-Time Skin Rendering, GPU Gems 3, "
@@ -47,6 +49,8 @@ SHARED = {
                      "Appl. Math. 11(2), 1963",
     "McCalpin1995": "J. McCalpin, Memory Bandwidth and Machine Balance in Current High Performance Computers, IEEE "
                     "TCCA Newsletter, 1995",
+    "MoreSorensen1983": "J. J. Moré, D. C. Sorensen, Computing a Trust Region Step, SIAM J. Sci. Stat. Comput. 4(3), "
+                        "1983",
     "Narkowicz2015": "K. Narkowicz, ACES Filmic Tone Mapping Curve, 2015",
     "OrenNayar1994": "M. Oren, S. Nayar, Generalization of Lambert's Reflectance Model, SIGGRAPH 1994",
     "Penner2011": "E. Penner, G. Borshukov, Pre-Integrated Skin Shading, GPU Pro 2, 2011",

@@ -1,5 +1,7 @@
-"""What a baked light comes from: an image, six faces or an array, checked and brought into one of two shapes
-(a lat-long, or a cube in the GL-direct layout) with its statistics."""
+"""Environments: an image, six faces or an array, checked and brought into one of two shapes, with statistics.
+
+The shapes are a lat-long and a cube in the GL-direct layout.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +47,10 @@ class Cell(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """`columns` : `rows` is the aspect ratio that tells a layout; `cells` are those of +X -X +Y -Y +Z -Z,
-    none for a lat-long."""
+    """A placement of faces in an image, known by its aspect ratio `columns` : `rows`.
+
+    cells: those of the faces +X -X +Y -Y +Z -Z; none for a lat-long.
+    """
 
     name: str
     columns: int
@@ -107,15 +111,21 @@ class Environment:
 
 
 def latlong_solid_angles(height: int, width: int) -> npt.NDArray[np.float64]:
-    """Steradians of one texel in each row of a lat-long, (height,): (2 pi/w)(cos th0 - cos th1)."""
+    """Return the solid angle, in steradians, of one texel in each row of a lat-long: (height,).
+
+    It is (2π/width)(cos θ0 - cos θ1) for the polar angles of the row's edges.
+    """
     centre = (np.arange(height) + 0.5) * (math.pi / height)
     # As a product of sines: the difference of cosines cancels at the poles.
     return (2 * math.pi / width) * 2 * np.sin(centre) * math.sin(0.5 * math.pi / height)
 
 
 def cube_solid_angles(size: int) -> npt.NDArray[np.float64]:
-    """Steradians of the texels of one cube face, (size, size), not to be written to: differences over the
-    corners of atan(x y / sqrt(1 + x^2 + y^2)), the solid angle between the face's centre and (x, y)."""
+    """Return the solid angles, in steradians, of the texels of one cube face: (size, size), read-only.
+
+    They are differences over the corners of atan(x y/√(1 + x² + y²)), the solid angle between the face's centre and (x,
+    y).
+    """
     return _kept_solid_angles(size) if size <= _KEPT_SIZE else _cube_solid_angles(size)
 
 
@@ -140,19 +150,18 @@ def environment(
     exposure: float = 0.0,
     nonfinite: Literal["refuse", "zero"] = "refuse",
 ) -> Environment:
-    """The environment of an image file, a folder of six faces, an array or another environment.
+    """Read an environment from an image file, a folder of six faces, an array or another environment.
 
-    source     an image in one of `LAYOUTS` (a 1 x 1 image is a constant); a .ktx, .ktx2, .dds, .env, .gltf or .glb
-               file, of which level 0 is taken, a cube or such an image; a folder with six square images
-               named px nx py ny pz nz, posx negx ... or right left top bottom front back (front is +Z); an
-               array (h, w) or (h, w, 1 | 3 | 4) of such an image, or (6, n, n) or (6, n, n, 1 | 3 | 4), of
-               floats (linear Rec.709) or uint8 or uint16 (sRGB)
-    rotate     degrees about +Y that increase the azimuth atan2(z, x) of everything; pixels are not resampled
-    exposure   EV in [-64, 64]: radiance is multiplied by 2**exposure
-    nonfinite  "refuse" NaN, inf and negative values, or make them "zero" and say so in `notices`
+    source: an image in one of `LAYOUTS` (a 1 × 1 image is a constant); a .ktx, .ktx2, .dds, .env, .gltf or .glb file,
+      of which level 0 is taken, a cube or such an image; a folder with six square images named px nx py ny pz nz, posx
+      negx … or right left top bottom front back (front is +Z); an array (h, w) or (h, w, 1 | 3 | 4) of such an image,
+      or (6, n, n) or (6, n, n, 1 | 3 | 4), of floats (linear Rec.709) or uint8 or uint16 (sRGB).
+    rotate: degrees about +Y that increase the azimuth atan2(z, x) of everything. Pixels are not resampled.
+    exposure: EV in [-64, 64]. Radiance is multiplied by 2^exposure.
+    nonfinite: "refuse" NaN, infinite and negative values, or make them "zero" and say so in `notices`.
 
-    Raises `UsageError` for an option out of its domain, `FileError` for what cannot be read, and `InputError`
-    for what was read and is not an environment.
+    Raises `UsageError` for an option out of its domain, `FileError` for what cannot be read, and `InputError` for what
+    was read and is not an environment.
     """
     check_options(rotate, exposure, nonfinite)
     turn = math.radians(math.remainder(rotate, 360.0))
@@ -186,7 +195,7 @@ def environment(
 
 
 def check_options(rotate: object, exposure: object, nonfinite: object) -> None:
-    """Raises `UsageError` for an option of `environment` out of its domain."""
+    """Raise `UsageError` for an option of `environment` that is out of its domain."""
     if not _is_number(rotate):
         raise UsageError(f"rotate is {rotate!r}, a finite angle in degrees was expected")
     if not _is_number(exposure) or abs(exposure) > 64:  # type: ignore[arg-type]
@@ -200,13 +209,13 @@ def _is_number(value: object) -> bool:
 
 
 def source_files(source: str | os.PathLike[str]) -> list[Path]:
-    """The files that `environment` reads of a path. Raises as it does for a folder without faces."""
+    """Return the files that `environment` reads for a path. Raises as it does for a folder without faces."""
     path = Path(source)
     return _face_paths(path) if os.path.isdir(path) else light_files(path)
 
 
 def source_digest(source: str | os.PathLike[str]) -> str:
-    """The `digest` of the environment at a path, without decoding it. Raises `FileError`, `InputError`."""
+    """Return the `digest` of the environment at a path, without decoding it. Raises `FileError`, `InputError`."""
     path = Path(source)
     if os.path.isdir(path):
         return _of_faces(digest_file(face) for face in _face_paths(path))
@@ -214,8 +223,10 @@ def source_digest(source: str | os.PathLike[str]) -> str:
 
 
 def extent(source: str | os.PathLike[str]) -> tuple[str, int, int]:
-    """("latlong" or "cube", rows, columns of it or of a face) by the header alone. Raises as `environment` does for a
-    header; of a texture level 0 is read."""
+    """Return the shape of an environment by its header alone: ("latlong" or "cube", rows, columns) of it or of a face.
+
+    Of a texture level 0 is read. Raises what `environment` raises for a header.
+    """
     path = Path(source)
     if os.path.isdir(path):
         size = image_facts(_face_paths(path)[0]).height
@@ -382,8 +393,11 @@ def _cells(layout: Layout, height: int, width: int) -> Iterator[tuple[slice, sli
 
 
 def faces_of(pixels: npt.NDArray[np.float32]) -> tuple[str, npt.NDArray[np.float32]] | None:
-    """The layout that an image (h, w, c) has by its aspect ratio, and its texels: as they are for a lat-long, else the
-    faces (6, n, n, c), GL-direct. None where no layout has it."""
+    """Return the name of the layout that an image (h, w, c) has by its aspect ratio, and its texels.
+
+    Those of a lat-long are as they are, others become faces (6, n, n, c), GL-direct. None where no layout has the
+    ratio.
+    """
     try:
         layout = _layout_of(pixels.shape, "the image")
     except InputError:
@@ -481,7 +495,7 @@ def _expose(texels: npt.NDArray[np.float32], exposure: float, name: str) -> None
 
 
 def statistics_of(env: Environment) -> dict[str, Any]:
-    """What `Environment.statistics` holds, from its texels."""
+    """Return the statistics of an environment's texels, as `Environment.statistics` holds them."""
     height, width = env.texels.shape[-3:-1]
     rows = env.texels.reshape(-1, width, 3)
     if env.kind == "latlong":
@@ -526,7 +540,7 @@ def statistics_of(env: Environment) -> dict[str, Any]:
 
 
 def channel_range(texels: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """The least and the largest value of each channel of (..., 3) texels, (3,) each."""
+    """Return the least and the largest value of each channel of (..., 3) texels, (3,) each."""
     # NumPy reduces to a last axis of three 20 times slower than a plane at a time.
     planes = [texels[..., k] for k in range(3)]
     return np.array([plane.min() for plane in planes]), np.array([plane.max() for plane in planes])

@@ -1,5 +1,7 @@
-"""The sphere in numpy: where texels and grid nodes lie, the order that keeps neighbours together, and the tables
-of quadrature nodes that the kernels read. Float64 throughout; `kernels/sphere.clh` says the same to a device."""
+"""The sphere in numpy: where texels and grid nodes lie, and the tables of quadrature nodes that kernels read.
+
+Float64 throughout. `kernels/sphere.clh` has the same geometry for a device.
+"""
 from __future__ import annotations
 
 import math
@@ -20,14 +22,21 @@ DOWN = np.array([[0, 0, 0, 0, 0, 0], [-1, -1, 0, 0, -1, -1], [0, 0, 1, -1, 0, 0]
 
 
 def cube_directions(face: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """(3, m) unit directions of face coordinates in [-1, 1], in the GL-direct layout."""
+    """Return the unit directions (3, m) of face coordinates in [-1, 1], in the GL-direct layout.
+
+    face: (m,) indices in the order +X -X +Y -Y +Z -Z. s, t: (m,), right and down.
+    """
     d = AXIS[:, face] + s * RIGHT[:, face] + t * DOWN[:, face]
     return d / np.sqrt(1 + s * s + t * t)
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Where a level is evaluated: the texel centres of a cube or of a lat-long image, or the nodes of a grid."""
+    """The points of a level: the texel centres of a cube, a lat-long or an octahedral map, or the nodes of a grid.
+
+    latlong, octahedral: the form; a cube where neither is set. size: edge of a face, or height of a lat-long. nodes:
+    whether the points are the nodes of an equiangular grid.
+    """
 
     latlong: bool
     size: int  # face edge, or height of the lat-long
@@ -36,20 +45,22 @@ class Shape:
 
     @property
     def dims(self) -> tuple[int, ...]:
+        """The shape of an array of the points: (rows, columns), or (6, rows, columns) for faces."""
         if self.octahedral:
             return self.size, self.size
         return (self.size, 2 * self.size) if self.latlong else (6, self.size, self.size)
 
     @property
     def count(self) -> int:
+        """Number of points."""
         return int(np.prod(self.dims))
 
     def coordinates(self) -> np.ndarray:
-        """(size,) face coordinates of a cube's texel centres or a grid's nodes."""
+        """Return the face coordinates, (size,), of a cube's texel centres or of a grid's nodes."""
         return grid_tangents(self.size) if self.nodes else (2 * np.arange(self.size) + 1) / self.size - 1
 
     def directions(self, index: np.ndarray | None = None) -> np.ndarray:
-        """(3, m) unit directions of texel centres, of all texels or of those with the flat indices given."""
+        """Return the unit directions (3, m) of all points, or of those with the flat indices given."""
         index = np.arange(self.count) if index is None else index
         if self.octahedral:
             return to_direction(*((2 * x + 1) / self.size - 1 for x in (index % self.size, index // self.size)))
@@ -58,7 +69,10 @@ class Shape:
         return cube_centres(self.size, index)
 
     def solid_angles(self, index: np.ndarray | None = None) -> np.ndarray:
-        """(m,) solid angles, of all texels or of those given; of an octahedral map's to second order."""
+        """Return the solid angles (m,) of all texels, or of those given, in steradians.
+
+        Those of an octahedral map are right to second order in 1/size.
+        """
         if self.octahedral:
             return (2 / self.size) ** 2 * octahedral_density(self.directions(index))
         if self.latlong:
@@ -68,7 +82,7 @@ class Shape:
         return np.tile(omega, 6) if index is None else omega[index % self.size**2]
 
     def mean(self, texels: np.ndarray) -> float:
-        """Mean of (dims, 3) texels over the sphere, all channels together."""
+        """Return the mean of (dims, 3) texels over the sphere, all channels together."""
         if self.octahedral:
             return float(np.average(texels.reshape(-1, 3).mean(1, dtype=np.float64), weights=self.solid_angles()))
         if self.latlong:
@@ -80,7 +94,7 @@ class Shape:
         return sum(float(np.einsum("ij,ij->", weights, plane)) for plane in grey) / (12 * math.pi)
 
     def tiled(self) -> np.ndarray:
-        """Flat indices in an order that keeps neighbours together: tiles of 4 × 4 within tiles of 8 × 8."""
+        """Return flat indices in an order that keeps neighbours together: tiles of 4 × 4 within tiles of 8 × 8."""
         index = np.arange(self.count, dtype=np.int32).reshape(-1, *self.dims[-2:])
         planes, height, width = index.shape
         if height % 8 or width % 8:
@@ -89,21 +103,23 @@ class Shape:
 
 
 def cube_centres(size: int, index: np.ndarray) -> np.ndarray:
-    """(3, m) directions of the texel centres of a cube, by flat index."""
+    """Return the directions (3, m) of the texel centres of a cube with faces of size², by flat index."""
     face, i, j = index // size**2, index // size % size, index % size
     return cube_directions(face, (2 * j + 1) / size - 1, (2 * i + 1) / size - 1)
 
 
 def latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
-    """(3, m) directions of the texel centres of a lat-long image, by flat index."""
+    """Return the directions (3, m) of the texel centres of a lat-long image, by flat index."""
     theta = (index // columns + 0.5) * math.pi / rows
     phi = (index % columns + 0.5) * 2 * math.pi / columns - math.pi
     return np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)])
 
 
 def turned_cube(texels: np.ndarray, matrix: Any) -> np.ndarray:
-    """A cube (6, s, s, …) as it is stored where the world's direction d is read at `matrix` @ d, a signed permutation
-    (3, 3): whole texels change places, none is resampled."""
+    """Return a cube (6, s, s, …) as an engine stores it that reads the world's direction d at `matrix` @ d.
+
+    matrix: a signed permutation (3, 3). Whole texels change places and none is resampled.
+    """
     world = np.asarray(matrix).T
     if (world == np.eye(3)).all():
         return texels
@@ -122,8 +138,10 @@ def turned_cube(texels: np.ndarray, matrix: Any) -> np.ndarray:
 
 
 def to_square(d: np.ndarray) -> np.ndarray:
-    """(2, m) u, v in [-1, 1] of directions (3, m), of any length, on the square of an octahedral map: d over |x| + |y|
-    + |z| lies on an octahedron, whose lower half is folded out [Praun2003]."""
+    """Return u, v in [-1, 1], (2, m), of directions (3, m) of any length on the square of an octahedral map.
+
+    d over |x| + |y| + |z| lies on an octahedron, whose lower half is folded out. [Praun2003]
+    """
     x, y, z = d / np.abs(d).sum(0)
     folded = y < 0
     u = np.where(folded, (1 - np.abs(z)) * _sign(x), x)
@@ -132,7 +150,7 @@ def to_square(d: np.ndarray) -> np.ndarray:
 
 
 def to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """(3, m) unit directions of u, v in [-1, 1]."""
+    """Return the unit directions (3, m) of u, v in [-1, 1] on the square of an octahedral map."""
     y = 1 - np.abs(u) - np.abs(v)
     folded = y < 0
     x = np.where(folded, (1 - np.abs(v)) * _sign(u), u)
@@ -142,8 +160,11 @@ def to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def octahedral_density(d: np.ndarray) -> np.ndarray:
-    """dω/du dv at directions (3, m): 1/|p|³, p = d/(|x| + |y| + |z|) on the octahedron, whose faces stand at 1/√3 to
-    the square and to the centre alike."""
+    """Return dω/du dv of an octahedral map at directions (3, m).
+
+    It is 1/|p|³, p = d/(|x| + |y| + |z|) on the octahedron, whose faces stand at 1/√3 to the square and to the centre
+    alike.
+    """
     return np.abs(d).sum(0) ** 3
 
 
@@ -153,7 +174,7 @@ def _sign(x: np.ndarray) -> np.ndarray:
 
 
 def face_coordinates(d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Face and its coordinates (s, t) in [-1, 1] of directions (3, m): the inverse of sphere.cube_directions."""
+    """Return the face and its coordinates (s, t) in [-1, 1] of directions (3, m): the inverse of `cube_directions`."""
     axis = np.abs(d).argmax(0)
     face = 2 * axis + (np.take_along_axis(d, axis[None], 0)[0] < 0)
     along = (AXIS[:, face] * d).sum(0)
@@ -161,7 +182,7 @@ def face_coordinates(d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def radiance_at(env: Environment, d: np.ndarray) -> np.ndarray:
-    """(m, 3) float64: the texel of the environment in directions (3, m), its rotation included."""
+    """Return the radiance of an environment in directions (3, m): (m, 3) float64, its rotation included."""
     c, s = math.cos(env.rotation), math.sin(env.rotation)
     x, y, z = c * d[0] + s * d[2], d[1], c * d[2] - s * d[0]
     rows, columns = env.texels.shape[-3:-1]
@@ -182,7 +203,10 @@ falls as N^-¾ however it lies."""
 
 
 def octahedral_means(env: Environment, shape: Shape, index: np.ndarray, lattice: tuple[int, int]) -> np.ndarray:
-    """(m, 3) float64: mean radiance over texels of an octahedral map, by flat index, from a lattice in each."""
+    """Return the mean radiance over texels of an octahedral map, by flat index: (m, 3) float64.
+
+    lattice: points in each texel and the step of the Fibonacci lattice, one of POINTS.
+    """
     count, step = lattice
     a, b = ((2 * np.arange(count) + 1) / count - 1, 2 * ((np.arange(count) * step % count + 0.5) / count) - 1)
     out = np.empty((len(index), 3))
@@ -199,7 +223,7 @@ def octahedral_means(env: Environment, shape: Shape, index: np.ndarray, lattice:
 
 
 def source_directions(env: Environment, index: np.ndarray) -> np.ndarray:
-    """(3, m) of texel centres of an environment in the world, by flat index, its rotation included."""
+    """Return the world directions (3, m) of an environment's texel centres, by flat index, its rotation included."""
     rows, columns = env.texels.shape[-3:-1]
     d = latlong_centres(rows, columns, index) if env.kind == "latlong" else cube_centres(rows, index)
     c, s = math.cos(env.rotation), math.sin(env.rotation)
@@ -207,19 +231,19 @@ def source_directions(env: Environment, index: np.ndarray) -> np.ndarray:
 
 
 def source_solid_angles(env: Environment) -> np.ndarray:
-    """Steradians of every texel of an environment, in the shape of its texels without the channels."""
+    """Return the solid angle, in steradians, of every texel of an environment, without the axis of channels."""
     shape = env.texels.shape[:-1]
     angles = latlong_solid_angles(*shape)[:, None] if len(shape) == 2 else cube_solid_angles(shape[1])
     return np.broadcast_to(angles, shape)
 
 
 def grid_tangents(n: int) -> np.ndarray:
-    """(n,) face coordinates of the nodes of an equiangular grid, BEYOND of them past each edge."""
+    """Return the face coordinates (n,) of the nodes of an equiangular grid, BEYOND of them past each edge."""
     return np.tan((2 * np.arange(n) + 1 - n) / (n - 2 * BEYOND) * math.pi / 4)
 
 
 def bounds(directions: np.ndarray, count: int) -> np.ndarray:
-    """(m, 4): centre and largest chord to it, of each `count` consecutive directions (3, m·count)."""
+    """Return the centre and the largest chord to it of each `count` consecutive directions (3, m·count): (m, 4)."""
     d = directions.reshape(3, -1, count)
     centre = d.mean(2)
     radius = np.sqrt(((d - centre[..., None]) ** 2).sum(0).max(1))
@@ -227,7 +251,7 @@ def bounds(directions: np.ndarray, count: int) -> np.ndarray:
 
 
 def composite(cuts: int) -> tuple[np.ndarray, np.ndarray]:
-    """cuts/2 cells of two Gauss points each on [0, 1]."""
+    """Return nodes and weights on [0, 1] of a composite rule: cuts/2 cells of two Gauss points each."""
     cells = cuts // 2
     x, w = gauss(2)
     nodes = (np.arange(cells)[:, None] + x) / cells
@@ -236,8 +260,14 @@ def composite(cuts: int) -> tuple[np.ndarray, np.ndarray]:
 
 def latlong_tables(rows: int, columns: int, x: np.ndarray, w: np.ndarray, rotation: float,
                    scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(cos θ, sin θ, weight) by refined row, each row's weights summing to cos θ0 - cos θ1; and
-    (cos φ, sin φ, weight) by refined column. `scale`: (rows,) of `corrections`, the weight sin θ Δθ scale instead."""
+    """Return the quadrature tables of a lat-long image, by refined row and by refined column.
+
+    rows, columns: those of the image. x, w: nodes and weights on [0, 1] within a texel. rotation: radians.
+    scale: (rows,) of `corrections`; weights are sin θ Δθ scale then.
+
+    The first is (cos θ, sin θ, weight), each row's weights summing to cos θ0 - cos θ1; the second (cos φ, sin φ,
+    weight).
+    """
     theta = (np.arange(rows)[:, None] + x) * (math.pi / rows)
     weight = np.sin(theta) * w
     if scale is None:
@@ -252,9 +282,14 @@ def latlong_tables(rows: int, columns: int, x: np.ndarray, w: np.ndarray, rotati
 
 def cube_tables(size: int, x: np.ndarray, w: np.ndarray,
                 scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(coordinate, weight, 0) by refined row; the same by column, followed by the factors (size, size) that bring
-    each texel's nodes to its exact solid angle. Many nodes get there to 1e-9 by themselves: factors of 1.
-    `scale`: (size,) of `corrections`, which takes their place."""
+    """Return the quadrature tables of a cube's face, by refined row and by refined column.
+
+    size: texels an edge. x, w: nodes and weights on [0, 1] within a texel.
+    scale: (size,) of `corrections`, which takes the place of the factors below.
+
+    Both are (coordinate, weight, 0); the second is flat and followed by factors (size, size) that bring each texel's
+    nodes to its exact solid angle. Many nodes get there to 1e-9 by themselves: factors of 1.
+    """
     s = ((np.arange(size)[:, None] + x) * (2 / size) - 1).ravel()
     weight = np.tile(w * (2 / size), size)
     correction = np.ones((size, size))
@@ -275,9 +310,11 @@ CENTRED = (863 / 960, 77 / 1440, -17 / 5760)
 class Correction:
     """The filter that makes point masses of texels, as `correct_rows` and `correct_columns` read it.
 
-    tap: (count, TAPS) int32, factor: (count, TAPS) float32 by output row and column; `inner` the factors of a
-    column far from the image's sides. `scales`: (rows,) and (columns,), what the filter makes of an image of
-    ones, by which the factors are divided and the nodes' weights are multiplied.
+    row_tap, column_tap: (count, TAPS) int32, the inputs of each output row and column.
+    row_factor, column_factor: (count, TAPS) float32, their factors.
+    inner: the factors of a column far from the sides of the image.
+    scales: (rows,) and (columns,), what the filter makes of an image of ones. Factors are divided by it, and the
+      weights of nodes are multiplied.
     """
 
     row_tap: np.ndarray
@@ -290,7 +327,7 @@ class Correction:
 
 @lru_cache(maxsize=16)
 def corrections(latlong: bool, rows: int, columns: int) -> Correction:
-    """The correction of a lat-long or a cube face of rows × columns texels, at least 16 of both."""
+    """Return the correction of a lat-long or a cube face of rows × columns texels, at least 16 of both."""
     c = np.array([*CENTRED[:0:-1], *CENTRED])
     if latlong:
         row: list[dict[int, float]] = [{} for _ in range(rows)]
@@ -331,8 +368,10 @@ def _taps(found: list[dict[int, float]]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def row_edges(rows: int, real: Any) -> np.ndarray:
-    """(cos θ, cot θ) of the rows + 1 edges; the poles' cotangents are ±1e300 (1e30 in float32), never used
-    but as a bound."""
+    """Return (cos θ, cot θ) of the rows + 1 edges of a lat-long's rows, (rows + 1, 2) of the type `real`.
+
+    The cotangents of the poles are ±1e30, which serve as bounds only.
+    """
     theta = np.arange(rows + 1) * math.pi / rows
     cosine, sine = np.cos(theta), np.sin(theta)
     if rows % 2 == 0:
@@ -343,8 +382,11 @@ def row_edges(rows: int, real: Any) -> np.ndarray:
 
 @cache
 def coarsening(fine: int, coarse: int, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The interpolation matrix (fine, coarse) between equiangular nodes, and for each coarse node the range
-    [first, last) of fine nodes it takes part in."""
+    """Return the matrix (fine, coarse) that interpolates between equiangular nodes, and the fine nodes it touches.
+
+    kind: "f" or "d", the type of the matrix. The second and third, (coarse,) int32, are the range [first, last) of fine
+    nodes that each coarse node takes part in.
+    """
     order = min(ORDER, coarse)
     ratio = (coarse - 2 * BEYOND) / (fine - 2 * BEYOND)
     x = (2 * np.arange(fine) + 1 - fine) / 2 * ratio + (coarse - 1) / 2  # in coarse node numbers

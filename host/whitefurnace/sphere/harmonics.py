@@ -1,5 +1,4 @@
-"""Spherical harmonics to degree 2 in numpy: irradiance from radiance, its exact least value over the sphere, the window
-that keeps it from ringing below zero, and the scalings in which engines want the coefficients.
+"""Spherical harmonics to degree 2: irradiance, its least value, windows against ringing, and engines' scalings.
 
 Coefficients are (9, 3) or (..., 9, 3): L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22 by RGB, of a real orthonormal
 basis in world x, y, z without the Condon-Shortley sign. Irradiance is E/π: a constant environment of 1 gives 1.
@@ -36,29 +35,32 @@ _ROUNDING = 16 * np.finfo(np.float64).eps
 
 # --------------------------------------------------------------------------------------------- evaluation
 def basis(directions: np.ndarray) -> np.ndarray:
-    """(9, m): the basis at unit directions (3, m)."""
+    """Return the nine basis functions at unit directions (3, m): (9, m)."""
     x, y, z = directions
     return FACTORS[:, None] * np.stack([np.ones_like(x), y, z, x, x * y, y * z, 3 * z * z - 1, x * z, x * x - y * y])
 
 
 def cosine(sh: np.ndarray) -> np.ndarray:
-    """Coefficients of E/π from those of the radiance, (..., 9, 3)."""
+    """Return the coefficients of E/π from those of the radiance, (..., 9, 3)."""
     return np.asarray(sh, np.float64) * COSINE[:, None]
 
 
 def evaluate(coefficients: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(..., m, 3): the function with coefficients (..., 9, 3) at unit directions (3, m)."""
+    """Return the function with coefficients (..., 9, 3) at unit directions (3, m): (..., m, 3)."""
     return np.einsum("km,...kc->...mc", basis(directions), coefficients)
 
 
 def irradiance_at(sh: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """(..., m, 3): E/π at unit normals (3, m), from radiance coefficients."""
+    """Return E/π at unit normals (3, m) from radiance coefficients: (..., m, 3)."""
     return evaluate(cosine(sh), directions)
 
 
 # ------------------------------------------------------------------------------------------------- minimum
 def polynomial(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """c (...), b (..., 3), Q (..., 3, 3) of c + b·n + nᵀQn, Q symmetric with trace 0, from coefficients (..., 9)."""
+    """Return c (...), b (..., 3), Q (..., 3, 3) of c + b·n + nᵀQn from coefficients (..., 9).
+
+    Q is symmetric with trace 0.
+    """
     k = np.asarray(coefficients, np.float64) * FACTORS
     b = k[..., [3, 1, 2]]
     xy, yz, zz, xz, xx_yy = (k[..., i] for i in range(4, 9))
@@ -67,24 +69,24 @@ def polynomial(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def coefficients_of(c: np.ndarray, b: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """(..., 9): the inverse of `polynomial`."""
+    """Return the coefficients (..., 9) of a polynomial: the inverse of `polynomial`."""
     k = np.stack([c, b[..., 1], b[..., 2], b[..., 0], 2 * q[..., 0, 1], 2 * q[..., 1, 2], q[..., 2, 2] / 2,
                   2 * q[..., 0, 2], (q[..., 0, 0] - q[..., 1, 1]) / 2], -1)
     return np.asarray(k / FACTORS)
 
 
 def minimum(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least value (...) over the sphere of functions with coefficients (..., 9), and where, unit vectors (..., 3).
+    """Return the least value (...) over the sphere of functions with coefficients (..., 9), and the unit vectors there.
 
     Exact, not sampled. On |n| = 1 the stationary points of c + b·n + nᵀQn are (Q - μ)n = -b/2, and the least value is
-    the one of the only μ ≤ λ₁, the least eigenvalue: the trust-region problem with its boundary [Moré & Sorensen 1983].
-    With t = λ₁ - μ ≥ 0, δᵢ = λᵢ - λ₁ and b in the eigenvectors' basis |n| = 1 is the secular equation
+    that of the only μ ≤ λ₁, the least eigenvalue: the trust-region problem with its boundary [MoreSorensen1983]. With t
+    = λ₁ - μ ≥ 0, δᵢ = λᵢ - λ₁ and b in the eigenvectors' basis |n| = 1 is the secular equation
 
         g(t) = Σ bᵢ² / (2(δᵢ + t))² = 1,   where   f = c + λ₁ - t - Σ bᵢ² / (4(δᵢ + t)).
 
-    If g(0) ≤ 1 (b has nothing along the first eigenvector) t = 0, and that eigenvector makes up the length of n. At
-    any t ≥ 0 the second line is no more than the least value (Lagrange's dual), so rounding of t errs to the second
-    order and to the safe side.
+    If g(0) ≤ 1 (b has nothing along the first eigenvector) t = 0, and that eigenvector makes up the length of n. At any
+    t ≥ 0 the second line is no more than the least value (Lagrange's dual), so rounding of t errs to the second order
+    and to the safe side.
     """
     c, b, q = polynomial(coefficients)
     eigenvalues, axes = np.linalg.eigh(q)
@@ -125,14 +127,14 @@ def minimum(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def least_irradiance(sh: np.ndarray) -> np.ndarray:
-    """(..., 3): the least E/π of each channel over all normals, from radiance coefficients (..., 9, 3)."""
+    """Return the least E/π of each channel over all normals, from radiance coefficients (..., 9, 3): (..., 3)."""
     return minimum(np.swapaxes(cosine(sh), -1, -2))[0]
 
 
 # -------------------------------------------------------------------------------------------------- window
 @dataclass(frozen=True)
 class Windowed:
-    """Radiance coefficients under a window, and what it did to the irradiance."""
+    """Radiance coefficients under a window, and the least irradiance without and with it."""
 
     values: np.ndarray  # (..., 9, 3)
     mode: str | float
@@ -142,7 +144,7 @@ class Windowed:
 
 
 def sh_window(text: str) -> str | float:
-    """The mode of `--sh window=auto|none|X`. Raises UsageError in one sentence."""
+    """Return the mode in the text of `--sh window=auto|none|X`. Raises UsageError in one sentence."""
     name, equals, value = text.partition("=")
     if name != "window" or not equals:
         raise UsageError(f"SH option {text!r} is not window=auto, window=none or window=X")
@@ -161,19 +163,23 @@ def _cutoff(cutoff: float) -> float:
 
 
 def sinc_window(cutoff: float) -> np.ndarray:
-    """(3,): sinc⁴(l/X) for l < X, else 0: the window of Filament's `cmgen --sh-window=X` [Sloan2017]."""
+    """Return the factors (3,) of a window by degree l: sinc⁴(l/X) for l < X = `cutoff`, else 0.
+
+    It is the window of Filament's `cmgen --sh-window=X`. [Sloan2017]
+    """
     degree = np.arange(3)
     return np.asarray(np.where(degree < cutoff, np.sinc(degree / cutoff)**4, 0.0))
 
 
 def windowed(sh: np.ndarray, mode: str | float = "auto") -> Windowed:
-    """Radiance coefficients (..., 9, 3) whose degrees 1 and 2 are damped, one window for all channels.
+    """Return radiance coefficients with degrees 1 and 2 damped so that their irradiance does not ring below zero.
 
-    "none" leaves them alone. A number X in [1, 1024] is `sinc_window(X)`: small damps most; X ≤ 3 is enough for any
-    environment that is nowhere negative, as it is enough for one sun. "auto" is the window with factors in [0, 1]
-    nearest to none, in RMS of E/π over sphere and channels, for which E ≥ 0 for every normal and channel: none at all
-    where that holds already. As the coefficients are the irradiance's projection, it is also the one with the least
-    RMSE against the true irradiance. Channels share it: a window each would turn the hue of what it damps.
+    sh: (..., 9, 3). One window is used for all channels, since a window each would turn the hue.
+    mode: "none" leaves them alone. A number X in [1, 1024] is `sinc_window(X)`: small damps most; X ≤ 3 is enough for
+      any environment that is nowhere negative, as it is enough for one sun. "auto" is the window with factors in [0, 1]
+      nearest to none, in RMS of E/π over sphere and channels, for which E ≥ 0 for every normal and channel: none at all
+      where that holds already. As the coefficients are the irradiance's projection, it is also the one with the least
+      RMSE against the true irradiance.
 
     Raises InputError for coefficients that are not finite, of another shape, or under "auto" of a negative mean, which
     no window mends; UsageError for another mode.
@@ -260,8 +266,11 @@ def _edge(channels: np.ndarray, mean: np.ndarray, ray: np.ndarray) -> tuple[np.n
 # --------------------------------------------------------------------------------------------------- error
 def rmse_against(sh: np.ndarray, irradiance: np.ndarray, directions: np.ndarray,
                  solid_angles: np.ndarray) -> tuple[float, float]:
-    """Relative RMSE and the largest |error| over the mean, of E/π by radiance coefficients (9, 3) against an
-    irradiance cube (6, s, s, 3), its texel centres (3, 6s²) and solid angles (6s²,). 0/0 is 0."""
+    """Return the relative RMSE of E/π by radiance coefficients, and its largest |error| over the mean.
+
+    sh: (9, 3). irradiance: the true cube, (6, s, s, 3). directions, solid_angles: of its texel centres, (3, 6s²) and
+    (6s²,). 0/0 is 0.
+    """
     want = np.asarray(irradiance, np.float64).reshape(-1, 3)
     weights = np.asarray(solid_angles, np.float64).reshape(-1, 1)
     wrong = irradiance_at(sh, directions) - want
@@ -272,8 +281,11 @@ def rmse_against(sh: np.ndarray, irradiance: np.ndarray, directions: np.ndarray,
 
 # ---------------------------------------------------------------------------------------------- directions
 def turned(sh: np.ndarray, matrix: Any) -> np.ndarray:
-    """Radiance coefficients (..., 9, 3) as an engine stores them that reads our direction d at P d, P a signed
-    permutation (3, 3): L'(P d) = L(d), so b' = P b and Q' = P Q Pᵀ. What the least value is does not change."""
+    """Return radiance coefficients (..., 9, 3) for an engine that reads our direction d at P d.
+
+    matrix: P, a signed permutation (3, 3). L'(P d) = L(d), so b' = P b and Q' = P Q Pᵀ; the least value does not
+    change.
+    """
     p = np.asarray(matrix, np.float64)
     if (p == np.eye(3)).all():
         return sh
@@ -283,19 +295,25 @@ def turned(sh: np.ndarray, matrix: Any) -> np.ndarray:
 
 # ------------------------------------------------------------------------------------------------ scalings
 def radiance(sh: np.ndarray) -> np.ndarray:
-    """As they are."""
+    """Return radiance coefficients as they are."""
     return sh
 
 
 def irradiance(sh: np.ndarray) -> np.ndarray:
-    """Coefficients of E (a constant environment of 1 gives π) with the Condon-Shortley sign, for glTF's
-    EXT_lights_image_based. Its text names no sign; Babylon.js, which loads it, and `cmgen --sh -i` have that one."""
+    """Return coefficients of E with the Condon-Shortley sign, for glTF's EXT_lights_image_based.
+
+    A constant environment of 1 gives π. The text of the extension names no sign; Babylon.js, which loads it, and `cmgen
+    --sh -i` have that one.
+    """
     return cosine(sh) * (math.pi * CONDON_SHORTLEY)[:, None]
 
 
 def filament(sh: np.ndarray) -> np.ndarray:
-    """What Filament's shader multiplies by 1, y, z, x, yx, yz, 3z² - 1, zx, x² - y²: E/π with the basis's factors
-    folded in (libs/ibl CubemapSH::preprocessSHForShader, shaders Irradiance_SphericalHarmonics)."""
+    """Return what Filament's shader multiplies by 1, y, z, x, yx, yz, 3z² - 1, zx, x² - y².
+
+    It is E/π with the basis's factors folded in (libs/ibl CubemapSH::preprocessSHForShader, shaders
+    Irradiance_SphericalHarmonics).
+    """
     return cosine(sh) * FACTORS[:, None]
 
 
@@ -314,8 +332,10 @@ def _from_polynomial() -> np.ndarray:
 
 
 def babylon(sh: np.ndarray) -> np.ndarray:
-    """The nine RGB vectors x, y, z, xx, yy, zz, yz, zx, xy of a Babylon.js .env file, such that Babylon's shader gives
-    E/π: not the polynomial of E/π itself, see `_from_polynomial`."""
+    """Return the nine RGB vectors x, y, z, xx, yy, zz, yz, zx, xy of a Babylon.js .env file.
+
+    Babylon's shader makes E/π of them. They are not the polynomial of E/π itself: see `_from_polynomial`.
+    """
     return np.asarray(np.linalg.inv(_from_polynomial()) @ cosine(sh))
 
 
@@ -325,5 +345,5 @@ SCALINGS: dict[str, Callable[[Any], np.ndarray]] = {
 
 
 def unscaled(values: np.ndarray, scaling: str) -> np.ndarray:
-    """Radiance coefficients (..., 9, 3) of an engine's: the inverse of SCALINGS[scaling]."""
+    """Return radiance coefficients (..., 9, 3) from those of an engine: the inverse of SCALINGS[scaling]."""
     return np.asarray(np.linalg.inv(SCALINGS[scaling](np.eye(9))) @ values)

@@ -1,4 +1,4 @@
-"""The texels of a level that lie nearest some directions: those that a certificate looks at beside its uniform draw."""
+"""Finds the texels of a level nearest to given directions, which a certificate checks beside its uniform draw."""
 from __future__ import annotations
 
 from functools import lru_cache
@@ -18,7 +18,10 @@ PART = 1 << 18
 
 
 def nearest_texels(shape: Shape, targets: np.ndarray, count: int) -> np.ndarray:
-    """The `count` texels of `shape` nearest to any of the unit directions `targets` (m, 3): flat indices, ascending."""
+    """Return the flat indices, ascending, of the `count` texels of `shape` nearest to any of the targets.
+
+    targets: unit directions, (m, 3).
+    """
     order, centres, radii = _tiles(shape)
     # |c - t|² of the nearest target; rounding, 1e-8 of a chord, is within what `bounds` adds to a radius.
     chord = np.sqrt(np.maximum((centres**2).sum(1) + 1 - 2 * (centres @ targets.T).max(1), 0))

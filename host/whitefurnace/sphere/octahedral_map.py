@@ -1,10 +1,10 @@
-"""The full sphere on one square by an octahedron, with borders that make bilinear reads seamless, and chains of such
-maps in one atlas.
+"""Octahedral maps: the full sphere on one square, borders for seamless bilinear reads, and chains of maps in an atlas.
 
-d, divided by |x| + |y| + |z|, lies on an octahedron; its upper half (y ≥ 0) seen from above is the inner diamond,
-u ↔ x, v ↔ z, and the lower half is folded out over the diamond's edges [Praun2003; Cigolle2014, section 2]. u goes
-right and v down, both in [-1, 1]: +Y is the centre, −Y all four corners, +X the middle of the right edge and +Z that of
-the lower one. Texel (i, j) of n x n has its centre at u = (2j + 1)/n − 1, v = (2i + 1)/n − 1."""
+d, divided by |x| + |y| + |z|, lies on an octahedron; its upper half (y ≥ 0) seen from above is the inner diamond, u ↔
+x, v ↔ z, and the lower half is folded out over the diamond's edges [Praun2003; Cigolle2014, section 2]. u goes right
+and v down, both in [-1, 1]: +Y is the centre, −Y all four corners, +X the middle of the right edge and +Z that of the
+lower one. Texel (i, j) of n x n has its centre at u = (2j + 1)/n − 1, v = (2i + 1)/n − 1.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +17,17 @@ from whitefurnace.sphere.grids import Shape, to_square
 
 
 def texel_directions(size: int) -> np.ndarray:
-    """(3, size²) unit directions of the texel centres, row by row."""
+    """Return the unit directions (3, size²) of the texel centres, row by row."""
     return Shape(False, size, octahedral=True).directions()
 
 
 def add_border(image: np.ndarray, b: int) -> np.ndarray:
-    """`image` (n, n, c) with b ≤ n texels around it, (n + 2b, n + 2b, c): beyond an edge stand the texels that lie
-    there on the sphere. Each edge is folded onto itself at its middle, (−1, v) and (−1, −v) being one direction, so
-    that what is k texels beyond is what is k texels within, in reverse order along the edge; at a corner both, which is
-    the opposite corner."""
+    """Return `image` (n, n, c) with a border of b ≤ n texels around it, (n + 2b, n + 2b, c).
+
+    Beyond an edge stand the texels that lie there on the sphere. Each edge is folded onto itself at its middle, (−1, v)
+    and (−1, −v) being one direction, so the texel k beyond an edge equals the texel k within, in reverse order along
+    the edge. At a corner both hold, which is the opposite corner.
+    """
     n = image.shape[0]
     if image.ndim != 3 or image.shape[1] != n or not 0 <= b <= n:
         raise ValueError(f"a border of {b} does not go around an image of shape {image.shape}")
@@ -34,14 +36,16 @@ def add_border(image: np.ndarray, b: int) -> np.ndarray:
 
 
 def strip_border(image: np.ndarray, b: int) -> np.ndarray:
-    """What `add_border` was given."""
+    """Return an image without its border of b texels: the inverse of `add_border`."""
     return image[b : image.shape[0] - b, b : image.shape[1] - b]
 
 
 def read_bilinear(image: np.ndarray, d: np.ndarray, b: int = 1) -> np.ndarray:
-    """(m, c): a map with a border of b ≥ 1 texels, read in directions (3, m) as a GPU does. Of a smooth function the
-    error is of second order in 1/n but within a texel of the octahedron's edges, whose creases make it of first order
-    there."""
+    """Return values (m, c) of a map with a border of b ≥ 1 texels, read in directions (3, m) as a GPU does.
+
+    For a smooth function the error is of second order in 1/n, except within a texel of the octahedron's edges, whose
+    creases make it of first order there.
+    """
     side = image.shape[0]
     if b < 1 or image.shape[1] != side or side <= 2 * b:
         raise ValueError(f"an image of shape {image.shape} has no border of {b} to read bilinearly")
@@ -52,7 +56,7 @@ def read_bilinear(image: np.ndarray, d: np.ndarray, b: int = 1) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Place:
-    """Where a level stands in an atlas: the first row and column of its texels, after its border, and its side."""
+    """The place of a level in an atlas: the first row and column of its texels, after its border, and its side."""
 
     row: int
     column: int
@@ -60,7 +64,10 @@ class Place:
 
 
 def atlas_places(size: int, levels: int, b: int) -> tuple[Place, ...]:
-    """Level 0 at the left, the others below each other at its right, each with its border of b."""
+    """Return the places of the levels: level 0 at the left, the others below each other at its right.
+
+    size: side of level 0. b: texels of border around each.
+    """
     if levels < 1 or size >> (levels - 1) < max(b, 1):
         raise ValueError(f"{levels} levels from {size} texels do not keep at least the {max(b, 1)} of a border")
     places = [Place(b, b, size)]
@@ -72,8 +79,10 @@ def atlas_places(size: int, levels: int, b: int) -> tuple[Place, ...]:
 
 
 def to_atlas(levels: Sequence[np.ndarray], b: int) -> tuple[np.ndarray, tuple[Place, ...]]:
-    """One image (height, width, c) of maps (n >> k, n >> k, c) with their borders, zero where there is none, and where
-    they are in it."""
+    """Return one image (height, width, c) of maps (n >> k, n >> k, c) with their borders, and their places in it.
+
+    What belongs to no map is 0.
+    """
     places = atlas_places(levels[0].shape[0], len(levels), b)
     height, width = (max(side + b for side in sides) for sides in
                      zip(*((p.row + p.side, p.column + p.side) for p in places), strict=True))
@@ -86,7 +95,7 @@ def to_atlas(levels: Sequence[np.ndarray], b: int) -> tuple[np.ndarray, tuple[Pl
 
 
 def from_atlas(image: np.ndarray, places: Sequence[Place], b: int) -> tuple[np.ndarray, ...]:
-    """The maps of an atlas, each with its border."""
+    """Return the maps of an atlas, each with its border of b texels."""
     return tuple(image[p.row - b : p.row + p.side + b, p.column - b : p.column + p.side + b] for p in places)
 
 

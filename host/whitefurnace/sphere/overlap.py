@@ -1,10 +1,10 @@
-"""The mean of a piecewise-constant source over output texels' solid angle: the float64 truth of level 0.
+"""The mean of a piecewise-constant source over output texels' solid angles: the float64 truth of level 0.
 
 `kernels/overlap.cl` finds the areas of overlap in closed form, from arcs of great circles and by clipping polygons;
 here they are iterated integrals. A lat-long source is integrated over azimuth by Gauss nodes and along the meridian
 exactly; a cube source over a face coordinate s by Gauss nodes and along t exactly. Between the breakpoints (source
-columns, corners, places where a side of the texel crosses a row) the integrand is analytic and the rows that
-a side lies in are fixed, so a texel is left with rounding only.
+columns, corners, places where a side of the texel crosses a row) the integrand is analytic and the rows that a side
+lies in are fixed, so a texel is left with rounding only.
 """
 from __future__ import annotations
 
@@ -35,14 +35,15 @@ piece."""
 
 def mean_over_texels(texels: npt.NDArray[np.float32], rotation: float, latlong_output: bool, size: int,
                      indices: npt.NDArray[np.integer]) -> Floats:
-    """(m, 3) float64: the mean radiance of a source over each output texel, by exact solid angles.
+    """Return the mean radiance of a source over each output texel, by exact solid angles: (m, 3) float64.
 
-    texels: radiance, (h, w, 3) a lat-long or (6, n, n, 3) a cube in the GL-direct layout, constant over each
-        texel. rotation: radians that the azimuth atan2(z, x) of the source grows by.
-    latlong_output, size: texels of a lat-long (size, 2 size) or else of a cube (6, size, size).
+    texels: radiance, (h, w, 3) of a lat-long or (6, n, n, 3) of a cube in the GL-direct layout, constant over each
+      texel.
+    rotation: radians by which the azimuth atan2(z, x) of the source grows.
+    latlong_output, size: whether the output is a lat-long (size, 2 size), else a cube (6, size, size).
     indices: (m,) flat indices of output texels.
 
-    Error: about 1e-12 of the largest radiance that touches the texel (`tests/test_overlap.py`).
+    The error is about 1e-12 of the largest radiance that touches the texel (`tests/sphere/test_overlap.py`).
     """
     flat = np.asarray(indices, np.int64)
     out = np.empty((len(flat), 3))

@@ -1,5 +1,8 @@
-"""The sun of an environment: taken out as a directional light, or clamped. A sun holds most of the light in a few
-texels; engines cast its shadows from a light of its own, and a prefiltered copy of it would light everything twice."""
+"""Finds the sun of an environment and takes it out as a directional light, or clamps it.
+
+A sun holds most of the light in a few texels. Engines cast its shadows from a light of its own, and a prefiltered copy
+of it would light everything twice.
+"""
 from __future__ import annotations
 
 import math
@@ -35,10 +38,13 @@ BESIDE = 2.5
 class Sun:
     """A sun as a directional light; RGB each.
 
-    `direction` points to it (unit, world); `angular_radius`, radians, is that of a disc of constant `radiance` with its
-    energy and ∫ L² dω; `irradiance` is what a surface facing it gets; `c` = irradiance/π, the radiance of a white
-    Lambertian surface that faces it, is the light colour of [Hoffman2012] and of most engines; `share` is its part of
-    the energy of the source; `texels` counts those that held it.
+    direction: points to it, a unit vector in the world.
+    angular_radius: radians, of a disc of constant `radiance` with the sun's energy and ∫ L² dω.
+    irradiance: that of a surface that faces it.
+    c: irradiance/π, the radiance of a white Lambertian surface that faces it, which is the light colour of
+      [Hoffman2012] and of most engines.
+    share: its part of the energy of the source.
+    texels: how many held it.
     """
 
     direction: tuple[float, float, float]
@@ -50,14 +56,14 @@ class Sun:
     texels: int
 
     def data(self) -> dict[str, Any]:
-        """As plain data, for manifests."""
+        """Return the sun as plain data, for manifests."""
         return {"direction": list(self.direction), "angular_radius": self.angular_radius,
                 "radiance": list(self.radiance), "irradiance": list(self.irradiance), "c": list(self.c),
                 "share": self.share, "texels": self.texels}
 
 
 def sun_mode(mode: str) -> tuple[str, float]:
-    """`keep`, `extract` or `clamp=X` as (name, X). Raises UsageError."""
+    """Return the mode `keep`, `extract` or `clamp=X` as (name, X). Raises UsageError."""
     name, equals, value = str(mode).partition("=")
     if name in ("keep", "extract") and not equals:
         return name, math.inf
@@ -73,11 +79,13 @@ def sun_mode(mode: str) -> tuple[str, float]:
 
 
 def without_sun(env: Environment, mode: str) -> tuple[Environment, Sun | None]:
-    """The environment with its sun dealt with as `mode` says, and the sun where it was extracted.
+    """Return the environment with its sun treated as `mode` says, and the sun where it was extracted.
 
-    extract: the texels that stand out about the brightest are filled with the mean of the sky beside them; what they
-    held above it is the sun, so that sun and sky add up to the source. clamp=X: no texel keeps more than X times the
-    mean, of its channels' mean; colours stay. Notices say what was taken. Raises UsageError for another mode.
+    extract: the texels that stand out around the brightest are filled with the mean of the sky beside them. What they
+      held above it is the sun, so sun and sky add up to the source.
+    clamp=X: no texel keeps more than X times the mean, by the mean of its channels. Colours stay.
+
+    Notices say what was taken. Raises UsageError for another mode.
     """
     name, bound = sun_mode(mode)
     if name == "keep":
