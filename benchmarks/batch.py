@@ -44,7 +44,7 @@ if __name__ == "__main__":
 
 
 def probes(folder: Path, count: int, size: int) -> int:
-    """Write `count` environments of six `size`² faces: sky, ground and a bright patch, with noise; return bytes of one."""
+    """Write `count` environments of six `size`² faces (sky, ground, a bright patch, noise); return the bytes of one."""
     random = np.random.default_rng(size)
     row = np.linspace(1, 0, 6 * size, dtype=np.float32)[:, None, None]
     for k in range(count):

@@ -105,7 +105,7 @@ def main() -> None:
         device.array(listed)
 
     def seconds(kernel: Kernel, last: list[np.generic], sources: int = count) -> float:
-        """Return the processor seconds of a launch, or wall seconds on a GPU. Variants take turns to share other load."""
+        """Return the processor seconds of a launch, or wall seconds on a GPU. Variants take turns to share the load."""
         clock = time.process_time if device.type == "cpu" else time.perf_counter
         begin = clock()
         device.launch(kernel, (outputs // lanes // device.vectors, 2), (
