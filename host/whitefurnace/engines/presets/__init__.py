@@ -8,12 +8,12 @@ import importlib
 import json
 import os
 import pkgutil
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
-import tomllib
 
 from whitefurnace.engines.engine import (
     FORMATS,
