@@ -26,7 +26,7 @@ from whitefurnace.files import write_exr
 from whitefurnace.prefiltering.certificate import texel_errors
 from whitefurnace.prefiltering.reading import Exact, single
 from whitefurnace.prefiltering.recipe import chain
-from whitefurnace.rendering import shading as rendering
+from whitefurnace.rendering import shading
 from whitefurnace.scenes.materials import Scene, read_scene
 from whitefurnace.sphere.environments import Environment, environment
 from whitefurnace.sphere.grids import radiance_at, source_directions
@@ -213,16 +213,16 @@ def test_lobes_are_those_of_the_prefilter(meter, device):
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["filament", "three", "bevy", "raw", "babylon"])
 def test_the_picture_is_that_of_the_files(name, device, tmp_path):
-    """X is what `rendering.shade` makes of the files that a bake wrote, whose axes differ: float32 sums apart."""
+    """X is what `shading.shade` makes of the files that a bake wrote, whose axes differ: float32 sums apart."""
     env, engine = lobed(), ENGINES[name]
     write_exr(tmp_path / "sky.exr", env.texels)
     scene = scene_of(tmp_path, *MIXED, plain((0.1, 0.1, 0.1), 0, 0.2, ior={"ior": 2.0}))
     baking.bake(tmp_path / "sky.exr", tmp_path / "out", for_=name, size=32, device=device)
-    lights = rendering.read_lights(engine, tmp_path / "out" / name, "sky")
+    lights = shading.read_lights(engine, tmp_path / "out" / name, "sky")
     meter = ErrorMeter(scene, environment(tmp_path / "sky.exr"), engine, device, count=COUNT)
     made = meter.budget(usual(engine, size=32))
     s = meter.sampled
-    X = rendering.shade(engine, lights, s.points.n, s.points.v, s.color, s.metal, s.roughness, s.f0)
+    X = shading.shade(engine, lights, s.points.n, s.points.v, s.color, s.metal, s.roughness, s.f0)
     off = texel_errors(X, meter.right, float(meter.right.mean()))
     # another seed of the certificate may refine a level: 1e-3 is its tolerance
     assert made.whole.rms == pytest.approx(float(np.sqrt((off * off).mean())), rel=2e-3, abs=1e-5)

@@ -14,7 +14,7 @@ from whitefurnace import bake
 from whitefurnace.cli import cli
 from whitefurnace.errors import InputError, UsageError
 from whitefurnace.files import read_stored, write_exr
-from whitefurnace.rendering import shading as rendering
+from whitefurnace.rendering import shading
 from whitefurnace.rendering import side_by_side as beside
 from whitefurnace.scenes import material_spheres
 
@@ -65,9 +65,9 @@ def test_a_sphere_is_that_of_the_grid(baked, tmp_path, engine):
     turned = read_stored(tmp_path / "b.exr")
     for got, grid in zip(np.split(turned, 3, 2), np.split(want, 3, 2), strict=True):
         assert np.array_equal(cells(got, 3)[::-1], cells(grid, 3))
-    rendering.render(baked / "noise.json", tmp_path / "grid.png", for_=engine, size=SIZE, columns=3, rows=2,
+    shading.render(baked / "noise.json", tmp_path / "grid.png", for_=engine, size=SIZE, columns=3, rows=2,
                      base_color=GOLD, background="plain")
-    rendering.render(baked / "noise.json", tmp_path / "a.png", for_=engine, size=SIZE, columns=3,
+    shading.render(baked / "noise.json", tmp_path / "a.png", for_=engine, size=SIZE, columns=3,
                      scene=tmp_path / "a.gltf", background="plain")
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "grid.png").read_bytes()
 
@@ -170,16 +170,16 @@ def test_the_command_names_each_with_its_place(baked, tmp_path):
             assert line.strip().startswith(name) and line.strip().removeprefix(name).split()[:2] == place
     # The place that is left is background, seen by the camera: as at the corners of a grid, to half a code.
     image = read_stored(tmp_path / "a.png")
-    whole = rendering.srgb(rendering.grid(*lights_of(baked), size=16, columns=2, rows=2))
+    whole = shading.srgb(shading.grid(*lights_of(baked), size=16, columns=2, rows=2))
     beside_spheres = np.ones((16, 16), bool)
-    beside_spheres.flat[rendering.sphere(16)[0]] = False
+    beside_spheres.flat[shading.sphere(16)[0]] = False
     assert np.abs(image - whole)[16:, 16:][beside_spheres].max() <= 0.5 / 255 + 1e-6
     assert len(np.unique(image[20:28, 20:28].reshape(-1, 3), axis=0)) > 1
 
 
 def lights_of(baked: Path):
-    engine, folder, stem = rendering.engine_in(baked / "noise.json", "filament")
-    return engine, rendering.read_lights(engine, folder, stem)
+    engine, folder, stem = shading.engine_in(baked / "noise.json", "filament")
+    return engine, shading.read_lights(engine, folder, stem)
 
 
 @pytest.mark.parametrize(("options", "error", "said"), [
@@ -200,5 +200,5 @@ def test_what_cannot_be_drawn_is_said(baked, tmp_path, options, error, said):
             beside.render(baked / "noise.json", tmp_path / "x.exr", for_="three", truth=baked / "noise.exr", scene=path,
                           **options)
         else:
-            rendering.render(baked / "noise.json", tmp_path / "x.png", for_="three", scene=path, **options)
+            shading.render(baked / "noise.json", tmp_path / "x.png", for_="three", scene=path, **options)
     assert "\n" not in str(raised.value) and not list(tmp_path.glob("x.*"))

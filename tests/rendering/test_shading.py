@@ -27,7 +27,7 @@ from whitefurnace.files import (
     write_png,
     write_texture,
 )
-from whitefurnace.rendering import shading as rendering
+from whitefurnace.rendering import shading
 from whitefurnace.rendering.shading import Lights
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere import octahedral_map as octamap
@@ -126,8 +126,8 @@ def constant(value: float):
 def spheres(engine: Engine, lights: Lights, **options) -> np.ndarray:
     """(rows, columns, m, 3): the pixels that are wholly of a sphere."""
     size = options.setdefault("size", 32)
-    picture = rendering.grid(engine, lights, background="plain", **options)
-    index, cover, _ = rendering.sphere(size)
+    picture = shading.grid(engine, lights, background="plain", **options)
+    index, cover, _ = shading.sphere(size)
     rows, columns = picture.shape[0] // size, picture.shape[1] // size
     cells = picture.reshape(rows, size, columns, size, 3).swapaxes(1, 2).reshape(rows, columns, -1, 3)
     return cells[:, :, index[cover == 1]]
@@ -144,7 +144,7 @@ def test_white_spheres_under_a_constant_sky(engine, tmp_path):
     split sum alone leaves a metal at A + B."""
     A, B = 0.625, 0.125  # exact in half floats
     written(engine, tmp_path, constant(1.0), constant(1.0), (A, B))
-    lights = rendering.read_lights(engine, tmp_path, "x")
+    lights = shading.read_lights(engine, tmp_path, "x")
     got = spheres(engine, lights, columns=3, rows=2)
     metal = dielectric = np.ones(())
     if engine.shading == "scaled":
@@ -166,21 +166,21 @@ X, Y = 0.15, 0.8
 """(∫Fc, ∫1) of a pixel, which is (A, B) = (Y - X, X)."""
 
 
-def as_written(shading: str, c: float, m: float, r: float, NoV: float) -> tuple[float, float]:
+def as_written(formula: str, c: float, m: float, r: float, NoV: float) -> tuple[float, float]:
     """Weights of radiance and E/π as the engine's shader has them, of one channel: Filament's light_indirect.fs,
     Babylon's pbrBlockFinalLitComponents, three.js's RE_IndirectSpecular_Physical, the viewer's pbr.frag."""
     mix = lambda a, b, t: a * (1 - t) + b * t  # noqa: E731
     f0 = 0.16 * 0.5**2 * (1 - m) + c * m
-    if shading == "split_sum":
+    if formula == "split_sum":
         E = f0 * (Y - X) + X
         return E, c * (1 - m) * (1 - E)
-    if shading == "scaled":
+    if formula == "scaled":
         E = mix(X, Y, f0)
         return E * (1 + f0 * (1 / Y - 1)), c * (1 - m) * (1 - E)
-    if shading == "babylon":
+    if formula == "babylon":
         return ((1 - f0) * X + f0 * Y) * (1 + f0 * (1 / Y - 1)), c * (1 - 0.04) * (1 - m)
     fab = (Y - X, X)
-    if shading == "fdez_aguera":
+    if formula == "fdez_aguera":
         single, multi = [], []
         for F in (0.04, c):
             FssEss = F * fab[0] + 1.0 * fab[1]
@@ -200,18 +200,18 @@ def as_written(shading: str, c: float, m: float, r: float, NoV: float) -> tuple[
     return mix(*found, m), mix(c * (1 - found[0]), 0, m)
 
 
-@pytest.mark.parametrize("shading", rendering.SHADINGS)
-def test_weights_are_those_of_the_engines_shader(shading):
-    got = np.array([[np.array(rendering.SHADINGS[shading](
+@pytest.mark.parametrize("formula", shading.SHADINGS)
+def test_weights_are_those_of_the_engines_shader(formula):
+    got = np.array([[np.array(shading.SHADINGS[formula](
         np.array([[Y - X]]), np.array([[X]]), np.array([[c]]), np.array([[m]]), np.array([[r]]), np.array([[0.4]]))
     ).ravel() for c in (0.0, 0.3, 1.0)] for m in (0.0, 0.25, 1.0) for r in (0.2, 0.9)])
-    wanted = np.array([[as_written(shading, c, m, r, 0.4) for c in (0.0, 0.3, 1.0)] for m in (0.0, 0.25, 1.0)
+    wanted = np.array([[as_written(formula, c, m, r, 0.4) for c in (0.0, 0.3, 1.0)] for m in (0.0, 0.25, 1.0)
                        for r in (0.2, 0.9)])
     np.testing.assert_allclose(got, wanted, atol=1e-10)
 
 
 def test_every_shading_of_a_preset_is_there():
-    assert {engine.shading for engine in ALL} == set(rendering.SHADINGS)
+    assert {engine.shading for engine in ALL} == set(shading.SHADINGS)
 
 
 @pytest.mark.parametrize(("x", "y", "NoV"), [("NoV", "roughness", "centres"), ("roughness", "NoV", "centres"),
@@ -227,7 +227,7 @@ def test_a_table_is_read_on_its_axes(x, y, NoV):
     mu, r = rng.uniform(0.04, 0.96, (2, 50))
     r = np.maximum(r, 0.2)  # α = .04 is beyond the first centre
     for form in ("scale_bias", "multiscatter"):
-        A, B = rendering.split_sum(Engine(dfg=Dfg(n, x=x, y=y, NoV=NoV, form=form)), held, mu, r)
+        A, B = shading.split_sum(Engine(dfg=Dfg(n, x=x, y=y, NoV=NoV, form=form)), held, mu, r)
         if form == "multiscatter":
             A, B = B, A + B
         np.testing.assert_allclose(A, np.sqrt(mu) if NoV == "sqrt" else mu, atol=1e-12)
@@ -245,8 +245,8 @@ def encoded(d: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("engine", ALL, ids=lambda e: e.name)
 def test_a_mirror_shows_the_mirror_directions_and_a_dielectric_the_normals(engine, tmp_path):
     written(engine, tmp_path, lambda k, d: encoded(d), lambda d: 1 + d.T / 3)
-    lights = rendering.read_lights(engine, tmp_path, "x")
-    _, cover, n = rendering.sphere(32)
+    lights = shading.read_lights(engine, tmp_path, "x")
+    _, cover, n = shading.sphere(32)
     n = n[:, cover == 1]
     assert n[2].min() > 0 and n[1, 0] > 0  # the first row is the upper one
     v = np.array([0.0, 0.0, 1.0])
@@ -259,7 +259,7 @@ def test_a_mirror_shows_the_mirror_directions_and_a_dielectric_the_normals(engin
     shown = shown + (diffuse - shown) * blend
     got = spheres(engine, lights, columns=1, rows=2)[:, 0]
     if engine.name in IMPORTED:
-        A, B = rendering.karis(n[2], np.full(n.shape[1], r))
+        A, B = shading.karis(n[2], np.full(n.shape[1], r))
         shown = shown * (A + B)[:, None]
     # A bilinear read between centres 2/64 apart errs by (2/64)²/8 · |f''| ≤ 1e-4, at a cube's corners, where the fourth
     # texel is the mean of three, by ¼ · 2/64 · |f'| = 4e-3; so at an octahedron's creases, its texels 3/2 as wide, and
@@ -270,9 +270,9 @@ def test_a_mirror_shows_the_mirror_directions_and_a_dielectric_the_normals(engin
     step = OCTAHEDRAL.get(engine.name, 4e-3) + half.get(engine.file[0].stored if engine.file else "", 2**-11)
     np.testing.assert_allclose(got[1], shown, atol=step)
     if lights.sh is not None or lights.irradiance is not None:
-        np.testing.assert_allclose(rendering.irradiance(engine, lights, n), 1 + n.T / 3, atol=step)
+        np.testing.assert_allclose(shading.irradiance(engine, lights, n), 1 + n.T / 3, atol=step)
     elif engine.name == "three":  # from 8² texels
-        np.testing.assert_allclose(rendering.irradiance(engine, lights, n), encoded(n), atol=8 * step)
+        np.testing.assert_allclose(shading.irradiance(engine, lights, n), encoded(n), atol=8 * step)
 
 
 def test_roughness_bends_blends_and_has_a_least():
@@ -288,7 +288,7 @@ def test_roughness_bends_blends_and_has_a_least():
     radiance = 0.75 * radiance + 0.25 * (10 + encoded(n))
     for r in (0.0, 0.5, [0.0, 0.5, 0.2]):
         for metal, wanted in ((1.0, radiance), (0.0, 0.04 * radiance + 0.96 * (10 + encoded(n)))):
-            got = rendering.shade(engine, lights, n, v, (1, 1, 1), metal, r)
+            got = shading.shade(engine, lights, n, v, (1, 1, 1), metal, r)
             # (2/128)²/8 · |f''|, |f''| ≤ 1 of a direction over the face's coordinate
             np.testing.assert_allclose(got, wanted, atol=1e-4)
 
@@ -305,7 +305,7 @@ numbers."""
 @pytest.mark.parametrize("engine", ALL, ids=lambda e: e.name)
 def test_levels_are_read_at_the_engines_lod(engine, tmp_path):
     written(engine, tmp_path, lambda k, d: constant(k + 1.0)(d), constant(2.0))
-    lights = rendering.read_lights(engine, tmp_path, "x")
+    lights = shading.read_lights(engine, tmp_path, "x")
     n = np.array([[0.0, 0.6], [0.0, 0.0], [1.0, 0.8]])
     v = np.array([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]])
     for r, lod in zip((0.0, 0.5, 1.0), LODS.get(engine.name, (0, 1, 2)), strict=True):
@@ -316,14 +316,14 @@ def test_levels_are_read_at_the_engines_lod(engine, tmp_path):
         if engine.name in UNLISTED:
             lod = engine.lods.at(max(r, engine.least), LEVELS.get(engine.name, 3), 64)
         # Small whole numbers are exact in all formats but BC6H and RGBD: half a step of theirs at 7.
-        got = rendering.specular(engine, lights, n, v, np.full(2, max(r, engine.least)))
+        got = shading.specular(engine, lights, n, v, np.full(2, max(r, engine.least)))
         close = 2e-2 if engine.name in UNLISTED else 1e-6
         close = {"three": 4e-3, "babylon": 2e-2, "gltf": 2e-2}.get(engine.name, close)
         np.testing.assert_allclose(got, 1 + lod, rtol=close)
     published = UNLISTED.get(engine.name)
     diffuse = {"three": 4, "unity": 7, "unreal": 5}.get(engine.name, 2)
     diffuse = 1 + lod if published is not None and published.diffuse_lod is not None else diffuse
-    assert rendering.irradiance(engine, lights, n) == pytest.approx(np.full((2, 3), diffuse), rel=4e-3)
+    assert shading.irradiance(engine, lights, n) == pytest.approx(np.full((2, 3), diffuse), rel=4e-3)
 
 
 # ------------------------------------------------------------------------------------------------- pictures
@@ -344,14 +344,14 @@ def baked(tmp_path):
 
 def test_a_picture_is_srgb_and_reads_back(baked, tmp_path):
     output = tmp_path / "grid.png"
-    made = rendering.render(baked, output, for_="filament", size=16, columns=2, rows=1)
+    made = shading.render(baked, output, for_="filament", size=16, columns=2, rows=1)
     assert (made.width, made.height, made.metalness) == (32, 16, (1.0,)) and made.roughness == (0.0, 1.0)
     assert [path.rsplit("/", 1)[1] for path in made.read] == ["x_ibl.ktx", "x_sh.txt", "x_dfg.ktx2"]
     # .5 is 1.055 · .5^(1/2.4) - .055 = .7353569 in sRGB [IEC 61966-2-1], of 255 the nearest is 188; background too
     assert np.unique(np.round(read_stored(output) * 255)).tolist() == [188]
-    rendering.render(baked, output, for_="filament", size=16, columns=2, rows=1, exposure=1.0, force=True)
+    shading.render(baked, output, for_="filament", size=16, columns=2, rows=1, exposure=1.0, force=True)
     assert np.unique(read_stored(output)).tolist() == [1]
-    rendering.render(baked, output, for_="filament", size=16, columns=1, exposure=-1, background="plain", force=True)
+    shading.render(baked, output, for_="filament", size=16, columns=1, exposure=-1, background="plain", force=True)
     grey = 1.055 * 0.09 ** (1 / 2.4) - 0.055
     assert read_stored(output)[0, 0] == pytest.approx(grey, abs=0.5 / 255)
 
@@ -359,7 +359,7 @@ def test_a_picture_is_srgb_and_reads_back(baked, tmp_path):
 def test_the_background_is_what_a_camera_sees(tmp_path):
     engine = ENGINES["three"]
     written(engine, tmp_path, lambda k, d: encoded(d), lambda d: 1 + d.T / 3)
-    picture = rendering.grid(engine, rendering.read_lights(engine, tmp_path, "x"), size=32, columns=2, rows=1)
+    picture = shading.grid(engine, shading.read_lights(engine, tmp_path, "x"), size=32, columns=2, rows=1)
     # 60° high and twice as wide, along -z: right is +x and up is +y, a corner's centre is half a pixel inside
     x, y = 2 * math.tan(math.radians(30)) * (1 - 1 / 64), math.tan(math.radians(30)) * (1 - 1 / 32)
     for row, column, corner in ((0, 0, (-x, y, -1)), (0, -1, (x, y, -1)), (-1, 0, (-x, -y, -1))):
@@ -381,7 +381,7 @@ def test_the_background_is_what_a_camera_sees(tmp_path):
 ])
 def test_what_cannot_be_drawn_is_said(baked, tmp_path, options, error, said):
     with pytest.raises(error, match=said):
-        rendering.render(baked, tmp_path / "grid.png", **{"for_": "filament", **options})
+        shading.render(baked, tmp_path / "grid.png", **{"for_": "filament", **options})
     assert not (tmp_path / "grid.png").exists()
 
 
@@ -389,21 +389,21 @@ def test_files_are_those_of_the_manifest(baked, tmp_path):
     output = tmp_path / "grid.png"
     output.write_bytes(b"mine")
     with pytest.raises(FileError, match="--force replaces it"):
-        rendering.render(baked, output, for_="filament")
+        shading.render(baked, output, for_="filament")
     with pytest.raises(UsageError, match=r"must end with \.png"):
-        rendering.render(baked, tmp_path / "grid.jpg", for_="filament")
+        shading.render(baked, tmp_path / "grid.jpg", for_="filament")
     chain = tmp_path / "filament" / "x_ibl.ktx"
     chain.write_bytes(chain.read_bytes()[:-1] + b"\0")
     with pytest.raises(InputError, match="it was changed since the bake"):
-        rendering.render(baked, tmp_path / "new.png", for_="filament")
+        shading.render(baked, tmp_path / "new.png", for_="filament")
     chain.unlink()
     with pytest.raises(FileError, match="lists it and it is not there"):
-        rendering.render(baked, tmp_path / "new.png", for_="filament")
+        shading.render(baked, tmp_path / "new.png", for_="filament")
     with pytest.raises(FileError, match="there is no such file"):
-        rendering.render(tmp_path / "y.json", tmp_path / "new.png", for_="filament")
+        shading.render(tmp_path / "y.json", tmp_path / "new.png", for_="filament")
     (tmp_path / "z.json").write_text("{}")
     with pytest.raises(InputError, match="is not the manifest of a bake"):
-        rendering.render(tmp_path / "z.json", tmp_path / "new.png", for_="filament")
+        shading.render(tmp_path / "z.json", tmp_path / "new.png", for_="filament")
 
 
 @pytest.mark.parametrize("text", ["", "1 2 3", "(1, 2, 3)\n" * 8, "(1, 2, nan)\n" * 9, "(1, 2, 1e999)\n" * 9, "{",
@@ -412,7 +412,7 @@ def test_a_text_that_holds_no_harmonics_is_refused(text, tmp_path):
     path = tmp_path / "x_sh.txt"
     path.write_text(text, "latin-1")
     with pytest.raises(InputError):
-        rendering.read_sh(path)
+        shading.read_sh(path)
 
 
 def test_the_command_says_what_it_drew(baked, tmp_path):

@@ -277,9 +277,9 @@ def layers(path) -> dict[str, np.ndarray]:
 
 def test_white_spheres_in_truth(baked, device: Device):
     """Under a white sky a white dielectric is white; a metal is its albedo, and 1 where it scatters again."""
-    from whitefurnace.rendering import shading as rendering
+    from whitefurnace.rendering import shading
 
-    index, cover, n = rendering.sphere(32)
+    index, cover, n = shading.sphere(32)
     for again in (False, True):
         row = shown(baked, str(baked / "white.json"), "--for", "filament", "-o", str(baked / "w.exr"), "--truth",
                     str(baked / "white.exr"), "--size", "32", "--columns", "3", "--rows", "2", "--certify", "2",

@@ -23,7 +23,7 @@ from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.certificate import texel_errors
 from whitefurnace.prefiltering.lighting import irradiance
 from whitefurnace.prefiltering.reading import bilinear
-from whitefurnace.rendering import shading as rendering
+from whitefurnace.rendering import shading
 from whitefurnace.rendering.shading import Lights
 from whitefurnace.rendering.truth import Points, Term, Truth, albedo, term
 from whitefurnace.scenes.material_spheres import DIELECTRIC, MaterialSphere, SphereLayout, layout_of
@@ -140,7 +140,7 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Rendered(rendering.Rendered):
+class Rendered(shading.Rendered):
     """A picture of three panels, with the errors and samples that are stated with it."""
 
     source: str = ""
@@ -317,8 +317,8 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
 
     Raises InputError where the image's digest is not the one in the manifest, and the errors of `environment`.
     """
-    written = rendering.dictionary(read_manifest(Path(manifest)))
-    recipe, source = rendering.dictionary(written.get("recipe")), rendering.dictionary(written.get("source"))
+    written = shading.dictionary(read_manifest(Path(manifest)))
+    recipe, source = shading.dictionary(written.get("recipe")), shading.dictionary(written.get("source"))
     item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
     turn, exposure = recipe.get("rotate"), recipe.get("exposure")
     for name, value in (("rotate", turn), ("exposure", exposure)):
@@ -334,10 +334,10 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
 
 def ndf_of(manifest: str | os.PathLike[str]) -> Spec:
     """The NDF with which a bake was filtered. Raises UsageError for one from a file."""
-    ndf = rendering.dictionary(rendering.dictionary(read_manifest(Path(manifest))).get("recipe")).get("ndf", "ggx")
+    ndf = shading.dictionary(shading.dictionary(read_manifest(Path(manifest))).get("recipe")).get("ndf", "ggx")
     if isinstance(ndf, str):
         return ndf
-    entry = rendering.dictionary(ndf)
+    entry = shading.dictionary(ndf)
     if "sha256" in entry or not isinstance(entry.get("name"), str):
         raise UsageError(f"{manifest} was filtered with an NDF from a file: give it as --ndf FILE.clh")
     given = {k: tuple(v) if isinstance(v, list) else v for k, v in entry.items() if k != "name"}
@@ -356,18 +356,18 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
     alike. Raises the errors of `shading.drawn`.
     """
     begin = time.perf_counter()
-    shown = rendering.drawn(engine, lights, layout, size=size, background=background)
+    shown = shading.drawn(engine, lights, layout, size=size, background=background)
     clock = {"engine": time.perf_counter() - begin}
-    index, cover, n = rendering.sphere(size)
+    index, cover, n = shading.sphere(size)
     points = Points(n, np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape))
     truth = Truth(device, env)
     spheres = Spheres(truth, material, points, further)
     groups: dict[float, list[int]] = {}
     for k, one in enumerate(layout.spheres):
         groups.setdefault(one.roughness if one.roughness >= MIRROR else 0.0, []).append(k)
-    picture = np.full(shown.shape, rendering.GREY)
+    picture = np.full(shown.shape, shading.GREY)
     if background == "environment":
-        picture = radiance_at(env, rendering.camera(shown.shape)).reshape(shown.shape)
+        picture = radiance_at(env, shading.camera(shown.shape)).reshape(shown.shape)
     difference, covered = np.zeros(shown.shape), np.zeros(shown.shape[:2], bool)
     mean, samples, estimates, certificate = float(np.mean(env.statistics["mean"])), [], [], []
     clock |= {"truth": 0.0, "certificate": 0.0}
@@ -380,7 +380,7 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
         for k, by_sky, by_lights in zip(those, true, extra, strict=True):
             one, (i, across) = layout.spheres[k], divmod(k, layout.columns)
             where = np.s_[i * size:(i + 1) * size, across * size:(across + 1) * size]
-            lit = rendering.shade(engine, lights, n, points.v, one.base_color, one.metalness, one.roughness,
+            lit = shading.shade(engine, lights, n, points.v, one.base_color, one.metalness, one.roughness,
                                   np.asarray(one.insulator))
             whole = by_sky + by_lights
             apart = (lit - by_sky) / np.maximum(whole @ LUMINANCE, max(DARK * mean, 1e-30))[:, None]
@@ -457,8 +457,8 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         raise UsageError(f"tolerance {bound:g} is outside [{low:g}, {high:g}]")
     if not 0 <= certify <= 1000:
         raise UsageError(f"certify {certify} is outside [0, 1000]")
-    if not -rendering.EXPOSURES <= exposure <= rendering.EXPOSURES:
-        raise UsageError(f"exposure {exposure:g} is outside [{-rendering.EXPOSURES:g}, {rendering.EXPOSURES:g}]")
+    if not -shading.EXPOSURES <= exposure <= shading.EXPOSURES:
+        raise UsageError(f"exposure {exposure:g} is outside [{-shading.EXPOSURES:g}, {shading.EXPOSURES:g}]")
     if output.exists() and not force:
         raise FileError(f"{output} exists; --force replaces it")
     if output.suffix.lower() == ".png":
@@ -466,8 +466,8 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         from whitefurnace.rendering.figures import draw_side_by_side
 
         plot_style.require()
-    engine, folder, stem = rendering.engine_in(manifest, for_)
-    lights = rendering.read_lights(engine, folder, stem)
+    engine, folder, stem = shading.engine_in(manifest, for_)
+    lights = shading.read_lights(engine, folder, stem)
     for name, spec in (("dielectric", dielectric), ("metal", metal)):
         if scene is not None and spec is not None:
             raise UsageError(f"{name} is of the grid: the materials of a scene have their own F0")
@@ -496,7 +496,7 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
         write_exr(output, np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
                   channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"), attributes=_stated(made))
     else:
-        draw_side_by_side(output, [rendering.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
+        draw_side_by_side(output, [shading.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
                          np.where(shown.covered, shown.luminance, np.nan), scale, engine.name, _caption(made),
                          {key: str(value) for key, value in _stated(made).items()})
     return made
