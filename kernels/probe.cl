@@ -1,5 +1,5 @@
 // Tells a device that works from one that is only listed: lanes, sqrt, fma, a division and a loop with a
-// uniform scalar, in the working precision. host/whitefurnace/device.py knows the right answer.
+// uniform scalar, in the working precision. host/whitefurnace/opencl/device.py knows the right answer.
 // -DSCALAR=float|double  -DW=1|2|4|8|16 lanes
 
 #ifdef cl_khr_fp64

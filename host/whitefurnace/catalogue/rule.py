@@ -62,8 +62,8 @@ def _ladder(family: str, panels: int, *steps: tuple[int, int, int]) -> tuple[Rul
 
 
 # The errors that height-correlated GGX shows against an independent 1-D form, n·v ≥ 1/256, α ≥ 1e-4, are in
-# tests/test_integrate.py. Neighbours differ in every factor: the error of one that two rules share would not show in
-# their difference. Each step costs about 1.5 times the one before.
+# tests/integrals/test_integrate.py. Neighbours differ in every factor: the error of one that two rules share would not
+# show in their difference. Each step costs about 1.5 times the one before.
 LADDERS = {
     # ring.clh: an NDF of the polar angle
     "gauss": _ladder("gauss", 1, (10, 16, 8), (12, 24, 10), (16, 32, 12), (20, 36, 16), (24, 40, 18), (32, 48, 24),

@@ -22,7 +22,8 @@ from whitefurnace.results import Integrated
 DEFAULT_TOLERANCE = {32: 1e-6, 64: 1e-12}
 BACKFACING = ("clamp", "absolute")
 
-# What float32 leaves however fine the rule: a relative part of the value, measured in tests/test_integrate.py.
+# What float32 leaves however fine the rule: a relative part of the value, as measured in
+# tests/integrals/test_integrate.py.
 ROUNDING = {32: 1e-6, 64: 2e-14}
 
 BLOCK = 64

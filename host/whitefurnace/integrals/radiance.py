@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -74,12 +75,16 @@ ENVIRONMENT_TOLERANCE = {32: 1e-5, 64: 1e-7}
 """Default, over the mean radiance: of piecewise constant images, which rules meet slowly where a texel sets."""
 
 
-def radiance(*, light: Spec | None = None, environment: Any = None, normal: Sequence[float] | None = None,
-             rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse", ndf: Spec | None = None,
-             masking: Spec = "smith", fresnel: Spec = "one", diffuse: Spec | None = None, brdf: Spec | None = None,
-             precision: int = 32, tolerance: float | None = None, backfacing: str | None = None,
-             device: Device | str | None = None, out: np.ndarray | None = None, progress: Progress | None = None,
-             **parameters: Any) -> Integrated:
+Surroundings = str | os.PathLike[str] | np.ndarray | Environment
+"""What `environment` reads."""
+
+
+def radiance(*, light: Spec | None = None, environment: Surroundings | None = None,
+             normal: Sequence[float] | None = None, rotate: float = 0.0, exposure: float = 0.0,
+             nonfinite: str = "refuse", ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
+             diffuse: Spec | None = None, brdf: Spec | None = None, precision: int = 32,
+             tolerance: float | None = None, backfacing: str | None = None, device: Device | str | None = None,
+             out: np.ndarray | None = None, progress: Progress | None = None, **parameters: Any) -> Integrated:
     """Compute reflected radiance; `whitefurnace.integrate` documents arguments, values and errors."""
     start = time.perf_counter()
     if precision not in (32, 64):
@@ -417,8 +422,8 @@ def _refuse_flat(name: str, light: Mapping[str, np.ndarray]) -> None:
 # ---------------------------------------------------------------------------------------------- environments
 
 
-def _environment_of(task: _Task, given: Any, normal: Sequence[float] | None, rotate: float, exposure: float,
-                    nonfinite: str, out: np.ndarray | None, start: float) -> Integrated:
+def _environment_of(task: _Task, given: Surroundings, normal: Sequence[float] | None, rotate: float,
+                    exposure: float, nonfinite: str, out: np.ndarray | None, start: float) -> Integrated:
     """Values (…, 3): the least radiance of each channel by the albedo, the rest over the texels' nodes."""
     frame = frame_of((0.0, 1.0, 0.0) if normal is None else normal)
     env = environment(given, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]

@@ -17,7 +17,7 @@ from whitefurnace.opencl.launch import evaluate, over_nodes
 
 AREA_NODES = {32: 96, 64: 224}
 """Chebyshev nodes of the table of Smith's area: 96 hold A to 3e-8, 224 to 1e-12 for every NDF of the catalogue over
-its domain but where its own rounding is more (tests/test_integrate.py)."""
+its domain but where its own rounding is more (tests/integrals/test_integrate.py)."""
 
 AREA_KEPT = {32: 2e-8, 64: 2e-14}
 """Coefficients at the end that add up to less are cut off."""

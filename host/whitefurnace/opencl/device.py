@@ -413,8 +413,8 @@ def _translated(device: Device, doing: str) -> Iterator[None]:
 def _first_errors(log: str, noise: Sequence[str] = (), limit: int = 3) -> str:
     """The first lines of a compiler's log that tell an error, joined by "; ", or nothing."""
     lines = [line.strip() for line in [*log.splitlines(), *noise]]
-    told = [line for line in lines if re.search(r"\b(fatal )?error:", line, re.IGNORECASE)]
-    return "; ".join(dict.fromkeys(told[:limit]))
+    errors = [line for line in lines if re.search(r"\b(fatal )?error:", line, re.IGNORECASE)]
+    return "; ".join(dict.fromkeys(errors[:limit]))
 
 
 def _define(name: str, value: int | float | str) -> str:
@@ -533,8 +533,8 @@ class Device:
                     except (cl.Error, OSError) as error:
                         failure = error
                 if failure is not None:
-                    told = _first_errors(str(failure), noise) or _first_line(failure)
-                    raise DeviceError(f"a kernel did not build on {self.name}: {told}") from failure
+                    why = _first_errors(str(failure), noise) or _first_line(failure)
+                    raise DeviceError(f"a kernel did not build on {self.name}: {why}") from failure
                 self._programs[key] = Program(self, raw)
             return self._programs[key]
 

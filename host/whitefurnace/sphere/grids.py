@@ -41,7 +41,7 @@ class Shape:
     latlong: bool
     size: int  # face edge, or height of the lat-long
     nodes: bool = False
-    octahedral: bool = field(default=False, repr=False)  # one square of an octahedral map (octamap.py)
+    octahedral: bool = field(default=False, repr=False)  # one square of an octahedral map (octahedral_map.py)
 
     @property
     def dims(self) -> tuple[int, ...]:

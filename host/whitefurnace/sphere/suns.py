@@ -95,7 +95,7 @@ def without_sun(env: Environment, mode: str) -> tuple[Environment, Sun | None]:
     level = flat.mean(1, dtype=np.float64)
     energy = float(level @ weights)
     if energy <= 0:
-        return _told(env, env.texels, f"{env.name} is black: there is no sun in it"), None
+        return _with(env, env.texels, f"{env.name} is black: there is no sun in it"), None
     if name == "clamp":
         return _clamped(env, flat, level, weights, energy, bound), None
     return _extracted(env, flat, level, weights, energy)
@@ -106,11 +106,11 @@ def _clamped(env: Environment, flat: np.ndarray, level: np.ndarray, weights: np.
     most = bound * energy / (4 * math.pi)
     over = level > most
     if not over.any():
-        return _told(env, env.texels, f"no texel is over {bound:g} times the mean: nothing was clamped")
+        return _with(env, env.texels, f"no texel is over {bound:g} times the mean: nothing was clamped")
     texels = flat.copy()
     texels[over] *= (most / level[over])[:, None].astype(np.float32)
     taken = float(((level - most) * weights)[over].sum()) / energy
-    return _told(env, texels.reshape(env.texels.shape),
+    return _with(env, texels.reshape(env.texels.shape),
                  f"{int(over.sum())} texels over {bound:g} times the mean were clamped, which took {100 * taken:.3g} % "
                  "of the energy")
 
@@ -124,14 +124,14 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
     around = index[cosine >= math.cos(CAP)]
     sky = float(np.median(level[ring])) if ring.size else 0.0
     if ring.size == 0 or level[top] <= STANDS_OUT * sky:
-        return _told(env, env.texels, f"no sun was found: the brightest texel is {level[top] / max(sky, 1e-30):.3g} "
+        return _with(env, env.texels, f"no sun was found: the brightest texel is {level[top] / max(sky, 1e-30):.3g} "
                                       f"times the sky around it, and {STANDS_OUT:g} times is what is looked for"), None
     # The geometric mean of peak and sky parts a disc from its glare; a black sky leaves a thousandth of the peak.
     bound = max(math.sqrt(level[top] * max(sky, 1e-6 * level[top])), STANDS_OUT * sky)
     held = around[level[around] > bound]
     beyond = ring[level[ring] > bound]
     if float(level[beyond] @ weights[beyond]) > WIDER * float(level[held] @ weights[held]):
-        return _told(env, env.texels, "no sun was found: what stands out about the brightest texel reaches further "
+        return _with(env, env.texels, "no sun was found: what stands out about the brightest texel reaches further "
                                       f"than {math.degrees(CAP):g}°, a panel rather than a sun"), None
     towards = source_directions(env, held)
     centre = towards @ (level[held] * weights[held])
@@ -151,16 +151,16 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
     irradiance = (weights[held] * (centre @ towards)) @ excess
     share = float(power.mean()) / energy
     if share < LEAST:
-        return _told(env, env.texels, f"no sun was found: what stands out most holds {100 * share:.2g} % of the energy "
+        return _with(env, env.texels, f"no sun was found: what stands out most holds {100 * share:.2g} % of the energy "
                                       f"and {100 * LEAST:g} % is what is looked for"), None
     sun = Sun(tuple(centre.tolist()), math.acos(max(-1.0, 1 - solid / (2 * math.pi))), tuple((power / solid).tolist()),
               tuple(irradiance.tolist()), tuple((irradiance / math.pi).tolist()), share, int(held.size))
-    told = (f"the sun was taken out of {held.size} texel{'s' if held.size > 1 else ''}, {100 * share:.3g} % of the "
+    text = (f"the sun was taken out of {held.size} texel{'s' if held.size > 1 else ''}, {100 * share:.3g} % of the "
             "energy: light it as a directional light of irradiance "
             f"({', '.join(f'{x:.4g}' for x in sun.irradiance)}) from ({', '.join(f'{x:.4f}' for x in sun.direction)})")
-    return _told(env, texels.reshape(env.texels.shape), told), sun
+    return _with(env, texels.reshape(env.texels.shape), text), sun
 
 
-def _told(env: Environment, texels: np.ndarray, notice: str) -> Environment:
+def _with(env: Environment, texels: np.ndarray, notice: str) -> Environment:
     found = replace(env, texels=texels, notices=(*env.notices, notice))
     return found if texels is env.texels else replace(found, statistics=statistics_of(found))
