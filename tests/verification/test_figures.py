@@ -61,11 +61,12 @@ def test_a_figure_a_model(device: Device, tmp_path: Path, slot: str, name: str) 
     assert colours(tmp_path / f"figures/{slot}_{name}.png") > 20
 
 
-@pytest.mark.few(2)
 @pytest.mark.parametrize("slot, name, text, parameters", [
-    ("ndf", "lobe", LOBE, {"spread": 0.3}), ("ndf", "lobe", LOBE, {}), ("ndf", "bare", BARE, {}),
-    ("ndf", "steep", STEEP, {}), ("brdf", "paint", PAINT, {"gloss": 0.4})],
-    ids=["lobe", "lobe-guessed", "bare", "steep", "brdf"])
+    pytest.param("ndf", "lobe", LOBE, {"spread": 0.3}, id="lobe", marks=pytest.mark.long),
+    pytest.param("ndf", "lobe", LOBE, {}, id="lobe-guessed", marks=pytest.mark.long),
+    pytest.param("ndf", "bare", BARE, {}, id="bare"),
+    pytest.param("ndf", "steep", STEEP, {}, id="steep", marks=pytest.mark.long),
+    pytest.param("brdf", "paint", PAINT, {"gloss": 0.4}, id="brdf")])
 def test_a_users_model(device: Device, tmp_path: Path, slot: str, name: str, text: str,
                        parameters: dict[str, float]) -> None:
     """With the parameters of its rows, or with guesses; a panel that a model has no values for says why."""
