@@ -596,9 +596,10 @@ def test_a_lost_scheduler_is_a_clear_end(scheduler, tmp_path, count):
     with pytest.raises(FileError) as caught:
         pool.run(STAGES, jobs, scheduler=address, on_result=lambda result: found.append(result.name))
     killer.join()
-    assert str(caught.value) == (f"the scheduler at {address} is gone: {len(set(found))} items were done before; run "
-                                 "it again to go on with the rest")
-    assert len(found) < count
+    done = len(set(found))
+    assert str(caught.value) == (f"the scheduler at {address} is gone: {done} item{' was' if done == 1 else 's were'} "
+                                 "done before; run it again to go on with the rest")
+    assert done < count
 
 
 def test_content_is_sent_by_value_where_asked(cluster):
