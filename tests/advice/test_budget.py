@@ -88,6 +88,7 @@ def test_constant_light_leaves_only_the_model(device, tmp_path):
     assert found["single scattering"].rms > 0.01
 
 
+@pytest.mark.long
 def test_a_mirror_has_texels_alone(device, tmp_path):
     env = lobed()
     meter = ErrorMeter(scene_of(tmp_path, plain(WHITE, 1, 0)), env, ENGINES["raw"], device, count=COUNT)
@@ -210,7 +211,7 @@ def test_lobes_are_those_of_the_prefilter(meter, device):
 # ------------------------------------------------------------------------------------------------- the engine's picture
 
 
-@pytest.mark.few(1)
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["filament", "three", "bevy", "raw", "babylon"])
 def test_the_picture_is_that_of_the_files(name, device, tmp_path):
     """X is what `shading.shade` makes of the files that a bake wrote, whose axes differ: float32 sums apart."""

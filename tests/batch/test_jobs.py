@@ -578,6 +578,7 @@ def test_a_death_at_every_step_of_writing(tmp_path, kind, again):
         assert tree(out) == want, f"after a death at step {step}, {calls[step]}"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stride", [4, pytest.param(1, marks=pytest.mark.long)])
 def test_a_death_in_the_run_after_a_death(tmp_path, stride):
     """The first run dies with one of its renames done, the second, of another recipe, at one step after another:

@@ -95,7 +95,7 @@ def test_every_kernel_has_a_case() -> None:
     assert len(set(names)) == len(names) and set(FLOPS) <= set(names)
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_a_case_is_measured(device: Device, meter: BenchMeter, case: benching.Case) -> None:
     rows = list(benching.throughput([case], device, meter, runs=2))

@@ -197,6 +197,7 @@ def test_special_functions_at_the_ends(device, precision):
 # ---------------------------------------------------------------------------------------------- D
 
 
+@pytest.mark.few(5)
 @EVERY
 @PRECISIONS
 def test_D_against_its_reference_over_the_domain(device, precision, name):

@@ -96,6 +96,7 @@ def test_normalization(device: Device, name: str, precision: int) -> None:
 FURNACE = [name for name, m in MASKINGS.items() if m.checks.weak_furnace == 1]
 
 
+@pytest.mark.few(5)
 @PRECISIONS
 @pytest.mark.parametrize("masking", FURNACE)
 @pytest.mark.parametrize("name", NDFS)
@@ -249,6 +250,7 @@ def test_albedo_with_smith(device: Device, name: str) -> None:
     check_quadrature(device, name, "smith", 30)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("masking", [n for n in MASKINGS if n != "smith"])
 @pytest.mark.parametrize("name", ISOTROPIC)
 def test_albedo_with_every_masking(device: Device, name: str, masking: str) -> None:

@@ -40,6 +40,7 @@ def energy_below(entry: Model, theta: np.ndarray, phi: np.ndarray, own: dict[str
     return np.interp(stretched, t, cdf / cdf[-1])
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize("entry, own", CASES, ids=lambda v: v.name if isinstance(v, Model) else
                          ",".join(f"{k}={x:g}" for k, x in v.items()))
 def test_chi2(device: Device, entry: Model, own: dict[str, Any]) -> None:

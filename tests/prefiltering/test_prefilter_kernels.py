@@ -76,6 +76,7 @@ def test_anterpolation_has_its_order(device: Device, source: tuple[int, ...], al
     assert pairs and plan.RATE - 1 <= max(pairs) <= constants.ORDER + 1, (alpha, source, errors, pairs)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("alpha", [0.03, 0.05, 0.2, 1.0])
 @pytest.mark.parametrize("source", [(32, 64), (17, 34), (5, 10), (1, 2), (6, 16, 16), (6, 5, 5), (6, 1, 1)], ids=str)
 def test_planned_grids_reach_their_tolerance(device: Device, source: tuple[int, ...], alpha: float) -> None:
@@ -102,6 +103,7 @@ def test_checkerboard(device: Device) -> None:
 # ---------------------------------------------------------------------------------------------- the exact sum
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("rotate", [0.0, 75.0])
 @pytest.mark.parametrize("alpha", [0.05, 0.2, 0.6, 1.0])
 @pytest.mark.parametrize("source", [(32, 64), (7, 14), (6, 16, 16), (6, 3, 3)], ids=str)
@@ -162,6 +164,7 @@ def test_lobe_norm_of_ggx(device: Device, alpha: float) -> None:
     assert reference.ggx_lobe_norm(alpha) == pytest.approx(float(integral), rel=1e-13 if alpha < 0.9 else 1e-9)
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", [n for n, m in models("ndf").items() if m.isotropic and m.from_roughness])
 @pytest.mark.parametrize("r", [0.1, 0.3, 0.7, 1.0])
 def test_lobe_norm(device: Device, name: str, r: float) -> None:

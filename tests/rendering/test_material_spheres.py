@@ -50,7 +50,7 @@ def cells(picture: np.ndarray, columns: int) -> np.ndarray:
     return picture.reshape(rows, SIZE, columns, SIZE, 3).swapaxes(1, 2).reshape(-1, SIZE, SIZE, 3)
 
 
-@pytest.mark.few(1)
+@pytest.mark.long
 @pytest.mark.parametrize("engine", ["filament", "three"])
 def test_a_sphere_is_that_of_the_grid(baked, tmp_path, engine):
     """A scene with the grid's own 3 × 2 materials is the grid, picture, truth and difference, to the bit; turned

@@ -49,7 +49,7 @@ def colours(path: Path) -> int:
     return len(np.unique(np.round(pixels.reshape(-1, pixels.shape[-1]), 3), axis=0))
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("slot, name", [("ndf", "gtr"), ("ndf", "beckmann_anisotropic"),
                                         ("masking", "schlick_smith"), ("fresnel", "schlick"), ("fresnel", "dielectric"),
                                         ("fresnel", "one"), ("diffuse", "minnaert")])
