@@ -64,6 +64,7 @@ bench: $(VENV)/device.done $(VENV)/test.done
 
 lint: $(VENV)/lint.done
 	@$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/mypy --config-file= --strict tests/typed_use.py
 

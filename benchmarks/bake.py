@@ -5,6 +5,7 @@ environment in the folder that WHITEFURNACE_ENVIRONMENTS names.
 
     python benchmarks/bake.py [-n RUNS] [--markdown]
 """
+
 from __future__ import annotations
 
 import argparse
@@ -39,8 +40,12 @@ def environments() -> list[str]:
 def bake(environment: str, output: str) -> tuple[float, float, float, list[dict]]:
     """Run one bake; return wall seconds, CPU seconds, peak memory in MB, and its JSON rows."""
     begin = time.perf_counter()
-    done = subprocess.run([sys.executable, "-c", RUN, "bake", environment, "-o", output, "--force", "--json"],
-                          capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, "bake", environment, "-o", output, "--force", "--json"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     wall = time.perf_counter() - begin
     usage = next(line for line in done.stderr.splitlines() if line.startswith("usage")).split()
     return wall, float(usage[1]), float(usage[2]) / 1000, [json.loads(line) for line in done.stdout.splitlines()]
@@ -62,14 +67,21 @@ def main() -> None:
             whole = runs[0][3][-1]
             device = whole["device"]
             cpu = [run[1] for run in runs]
-            rows.append([Path(environment).stem,
-                         f"{statistics.median(cpu):.2f} ({min(cpu):.2f} … {max(cpu):.2f})",
-                         f"{statistics.median(run[0] for run in runs):.2f}",
-                         f"{max(run[2] for run in runs):.0f}",
-                         f"{max(row['error'] for row in levels):.1e}", f"{max(row['worst'] for row in levels):.1e}",
-                         f"{whole['dfg']['error']:.1e}"])
-    print(f"{device.get('name')}, {device.get('platform')} {device.get('driver')}; {os.cpu_count()} cores; "
-          f"median of {options.runs} runs")
+            rows.append(
+                [
+                    Path(environment).stem,
+                    f"{statistics.median(cpu):.2f} ({min(cpu):.2f} … {max(cpu):.2f})",
+                    f"{statistics.median(run[0] for run in runs):.2f}",
+                    f"{max(run[2] for run in runs):.0f}",
+                    f"{max(row['error'] for row in levels):.1e}",
+                    f"{max(row['worst'] for row in levels):.1e}",
+                    f"{whole['dfg']['error']:.1e}",
+                ]
+            )
+    print(
+        f"{device.get('name')}, {device.get('platform')} {device.get('driver')}; {os.cpu_count()} cores; "
+        f"median of {options.runs} runs"
+    )
     if options.markdown:
         print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
         print("\n".join("| " + " | ".join(row) + " |" for row in rows))

@@ -5,6 +5,7 @@ cost model (fixed, per item, per byte) with a prediction.
 
     python benchmarks/batch.py [--items N ...] [--sizes S ...] [--workers N ...] [--tolerance X] [--predict N]
 """
+
 from __future__ import annotations
 
 import argparse
@@ -50,7 +51,7 @@ def probes(folder: Path, count: int, size: int) -> int:
     for k in range(count):
         image = (0.2 + row * np.float32([0.4, 0.6, 1.0])) * random.uniform(0.9, 1.1, (6 * size, size, 1))
         at = random.integers(0, 6 * size - 4), random.integers(0, size - 4)
-        image[at[0]:at[0] + 4, at[1]:at[1] + 4] = 500
+        image[at[0] : at[0] + 4, at[1] : at[1] + 4] = 500
         write_exr(folder / f"probe{k:05d}.exr", image.astype(np.float32))
     return (folder / "probe00000.exr").stat().st_size
 
@@ -58,13 +59,15 @@ def probes(folder: Path, count: int, size: int) -> int:
 def run(folder: Path, count: int, options: argparse.Namespace, workers: int) -> dict[str, float]:
     """Bake the first `count` probes; return seconds and bytes by name."""
     names = ", ".join(f'"probe{k:05d}.exr"' for k in range(count))
-    (folder / "job.toml").write_text(f'[[bake]]\nenvironments = [{names}]\noutput = "out"\nsize = {options.size}\n'
-                                     f'tolerance = {options.tolerance}\n')
+    (folder / "job.toml").write_text(
+        f'[[bake]]\nenvironments = [{names}]\noutput = "out"\nsize = {options.size}\ntolerance = {options.tolerance}\n'
+    )
     script = folder / "run.py"  # a file, because worker processes import their main module
     script.write_text(RUN)
     begin = time.perf_counter()
-    done = subprocess.run([sys.executable, str(script), str(folder / "job.toml"), str(workers)], capture_output=True,
-                          text=True)
+    done = subprocess.run(
+        [sys.executable, str(script), str(folder / "job.toml"), str(workers)], capture_output=True, text=True
+    )
     if done.returncode:
         sys.exit(done.stderr)
     used = json.loads(done.stdout)
@@ -89,8 +92,21 @@ def main() -> None:
     options = parser.parse_args()
     usual = 128 if 128 in options.sizes else options.sizes[0]
     most = max(options.items)
-    head = ["faces", "workers", "items", "wall s", "CPU s", "CPU ms/item", "read", "compute", "write", "kernels",
-            "wall / stages", "wall / kernels", "peak MB"]
+    head = [
+        "faces",
+        "workers",
+        "items",
+        "wall s",
+        "CPU s",
+        "CPU ms/item",
+        "read",
+        "compute",
+        "write",
+        "kernels",
+        "wall / stages",
+        "wall / kernels",
+        "peak MB",
+    ]
     rows, points = [], []
     with tempfile.TemporaryDirectory(prefix="whitefurnace-batch-") as top:
         for size in options.sizes:
@@ -106,11 +122,21 @@ def main() -> None:
                     kernels = "", ""
                     if used["kernels"] is not None:
                         kernels = f"{used['kernels']:.2f}", f"{used['wall'] / max(used['kernels'], files):.2f}"
-                    rows.append([f"{size}²", f"{workers}", f"{count}", f"{used['wall']:.2f}", f"{used['cpu']:.2f}",
-                                 f"{used['cpu'] / count * 1e3:.0f}",
-                                 *(f"{used[name]:.2f}" for name in ("read", "compute", "write")),
-                                 kernels[0], f"{used['wall'] / stages:.2f}", kernels[1],
-                                 f"{used['peak'] / 1e6:.0f}"])
+                    rows.append(
+                        [
+                            f"{size}²",
+                            f"{workers}",
+                            f"{count}",
+                            f"{used['wall']:.2f}",
+                            f"{used['cpu']:.2f}",
+                            f"{used['cpu'] / count * 1e3:.0f}",
+                            *(f"{used[name]:.2f}" for name in ("read", "compute", "write")),
+                            kernels[0],
+                            f"{used['wall'] / stages:.2f}",
+                            kernels[1],
+                            f"{used['peak'] / 1e6:.0f}",
+                        ]
+                    )
                     if workers == 1:
                         points.append((size == usual, count, count * nbytes, used["cpu"], used["wall"]))
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
@@ -120,17 +146,24 @@ def main() -> None:
     alike = np.array([point[0] for point in points])
     ones, items, nbytes = np.ones(len(table)), table[:, 0], table[:, 1]
     one = nbytes[alike][0] / items[alike][0]
-    fixed, each, byte = fit([ones, items, nbytes], table[:, 2]) if len(options.sizes) > 1 else (
-        *fit([ones, items], table[:, 2]), 0.0)
+    fixed, each, byte = (
+        fit([ones, items, nbytes], table[:, 2]) if len(options.sizes) > 1 else (*fit([ones, items], table[:, 2]), 0.0)
+    )
     off = np.max(np.abs((fixed + items * each + nbytes * byte) / table[:, 2] - 1))
-    print(f"CPU: {fixed:.2f} s + {each * 1e3:.1f} ms per item + {byte * 1e9:.1f} ms per MB read, at most {off:.0%} "
-          f"off above; {options.predict} items of {one / 1e6:.2f} MB: "
-          f"{fixed + options.predict * (each + byte * one):.0f} s")
+    print(
+        f"CPU: {fixed:.2f} s + {each * 1e3:.1f} ms per item + {byte * 1e9:.1f} ms per MB read, at most {off:.0%} "
+        f"off above; {options.predict} items of {one / 1e6:.2f} MB: "
+        f"{fixed + options.predict * (each + byte * one):.0f} s"
+    )
     fixed, each = fit([ones[alike], items[alike]], table[alike, 3])
-    print(f"wall, one worker, {usual}²: {fixed:.2f} s + {each * 1e3:.1f} ms per item; {options.predict} items: "
-          f"{fixed + options.predict * each:.0f} s")
-    print(f"{os.cpu_count()} cores; wall / stages: over all computing, or all reading and writing, of a worker; wall / "
-          f"kernels: over the kernels' own time, or all reading and writing")
+    print(
+        f"wall, one worker, {usual}²: {fixed:.2f} s + {each * 1e3:.1f} ms per item; {options.predict} items: "
+        f"{fixed + options.predict * each:.0f} s"
+    )
+    print(
+        f"{os.cpu_count()} cores; wall / stages: over all computing, or all reading and writing, of a worker; wall / "
+        f"kernels: over the kernels' own time, or all reading and writing"
+    )
 
 
 if __name__ == "__main__":

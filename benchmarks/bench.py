@@ -7,6 +7,7 @@ that WHITEFURNACE_ENVIRONMENTS names.
 
 --docs writes the tables into docs/bench.md and the plot into docs/pictures.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -30,8 +31,12 @@ def environments() -> list[str]:
 
 def bench(*arguments: str) -> list[dict]:
     """Run `whitefurnace bench`; return its JSON rows."""
-    done = subprocess.run([sys.executable, "-m", "whitefurnace", "bench", *arguments, "--json"], stdout=subprocess.PIPE,
-                          text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "whitefurnace", "bench", *arguments, "--json"],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
@@ -53,17 +58,26 @@ def throughput(rows: list[dict]) -> tuple[str, list[str], list[list[str]]]:
     """Return a heading, the columns, and a row for each kernel with its rates in float32 and float64."""
     can = next(row for row in rows if row["event"] == "yardstick")
     peaks = ", ".join(f"{three(spread)} GFLOP/s in {name}" for name, spread in can["gflops"].items())
-    said = (f"{machine(can['device'])} Multiply-adds {peaks}; memory read {three(can['read_gbytes'])} GB/s, triad "
-            f"{three(can['triad_gbytes'])} GB/s.")
+    said = (
+        f"{machine(can['device'])} Multiply-adds {peaks}; memory read {three(can['read_gbytes'])} GB/s, triad "
+        f"{three(can['triad_gbytes'])} GB/s."
+    )
     found = {(row["case"], row["precision"]): row for row in rows if row["event"] == "case"}
     table = []
     for case in dict.fromkeys(name for name, _ in found):
         cells = [case, next(row["unit"] for row in found.values() if row["case"] == case) + "s"]
         for precision in (32, 64):
             row = found.get((case, precision))
-            cells += ["", "", "", ""] if row is None else [
-                three(row["per_second"], 1e-6), number(row["gflops"]),
-                "" if row["of_peak"] is None else f"{row['of_peak']:.2f}", f"{row['of_memory']:.2f}"]
+            cells += (
+                ["", "", "", ""]
+                if row is None
+                else [
+                    three(row["per_second"], 1e-6),
+                    number(row["gflops"]),
+                    "" if row["of_peak"] is None else f"{row['of_peak']:.2f}",
+                    f"{row['of_memory']:.2f}",
+                ]
+            )
         table.append(cells)
     columns = ["GFLOP/s", "of peak", "of memory"]
     return said, ["kernel", "unit", "float32: M/s (min … max)", *columns, "float64: M/s (min … max)", *columns], table
@@ -78,8 +92,11 @@ def tradeoff(rows: list[dict]) -> tuple[str, list[str], list[list[str]]]:
         cells = [method, f"{setting:g}"]
         for name in names:
             row = found.get((method, setting, name))
-            cells.append("" if row is None else f"{number(1e3 * row['seconds']['median'])} ms, {row['error']:.1e}"
-                         + (" *" if row["front"] else ""))
+            cells.append(
+                ""
+                if row is None
+                else f"{number(1e3 * row['seconds']['median'])} ms, {row['error']:.1e}" + (" *" if row["front"] else "")
+            )
         table.append(cells)
     device = next(row for row in rows if row["event"] == "device")["device"]
     return f"{machine(device)} * is on the front.", ["method", "setting", *names], table
@@ -92,8 +109,12 @@ def markdown(said: str, head: list[str], rows: list[list[str]]) -> str:
 
 def plain(said: str, head: list[str], rows: list[list[str]]) -> str:
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
-    return "\n".join([said, *("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
-                              for row in [head, *rows])])
+    return "\n".join(
+        [
+            said,
+            *("  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in [head, *rows]),
+        ]
+    )
 
 
 def main() -> None:
@@ -105,16 +126,19 @@ def main() -> None:
     options = parser.parse_args()
     folder = str(PAGE.parent / "pictures") if options.docs else options.plot
     runs = ["--runs", str(options.runs)]
-    parts = {"throughput": throughput(bench(*runs)),
-             "tradeoff": tradeoff(bench("tradeoff", *environments(), *runs, *(["--plot", folder] if folder else [])))}
+    parts = {
+        "throughput": throughput(bench(*runs)),
+        "tradeoff": tradeoff(bench("tradeoff", *environments(), *runs, *(["--plot", folder] if folder else []))),
+    }
     for name, part in parts.items():
         if options.docs:
             text = PAGE.read_text("utf-8")
             block = re.compile(rf"(<!-- {name}: [^\n]*-->\n).*?(<!-- end -->)", re.DOTALL)
             if not block.search(text):
                 sys.exit(f"docs/bench.md has no <!-- {name}: … --> … <!-- end -->")
-            PAGE.write_text(block.sub(lambda found, part=part: found[1] + markdown(*part) + "\n" + found[2], text),
-                            "utf-8")
+            PAGE.write_text(
+                block.sub(lambda found, part=part: found[1] + markdown(*part) + "\n" + found[2], text), "utf-8"
+            )
         print(markdown(*part) if options.markdown else plain(*part), end="\n\n")
 
 

@@ -5,6 +5,7 @@ and float64, on a warm kernel cache.
 
     python benchmarks/integrals.py [-n RUNS] [--markdown]
 """
+
 from __future__ import annotations
 
 import argparse
@@ -34,20 +35,32 @@ def main() -> None:
     for name in models("ndf"):
         parameters = rows_of_roughness(chosen("ndf", name), r[:, None])
         for precision in (32, 64) if device.fp64 else (32,):
+
             def run(name=name, parameters=parameters, precision=precision):
-                return integrate("albedo", ndf=name, NoV=NoV, precision=precision, tolerance=TOLERANCE, device=device,
-                                 **parameters)
+                return integrate(
+                    "albedo", ndf=name, NoV=NoV, precision=precision, tolerance=TOLERANCE, device=device, **parameters
+                )
 
             run()  # builds the kernels if they are not in the cache
             runs = [run() for _ in range(options.runs)]
             seconds = [done.seconds for done in runs]
             work = runs[0].evaluations
             spread = f"({1e3 * min(seconds):.0f} … {1e3 * max(seconds):.0f})"
-            rows.append([name, str(precision), f"{1e3 * statistics.median(seconds):.0f} {spread}",
-                         f"{work / statistics.median(seconds) / 1e6:.0f}", f"{work / runs[0].values.size:.0f}",
-                         f"{runs[0].error:.1e}", runs[0].rule])
-    print(f"{device.identity()['name']} ({device.identity()['platform']}), tolerance {TOLERANCE:g}, "
-          f"median of {options.runs} runs")
+            rows.append(
+                [
+                    name,
+                    str(precision),
+                    f"{1e3 * statistics.median(seconds):.0f} {spread}",
+                    f"{work / statistics.median(seconds) / 1e6:.0f}",
+                    f"{work / runs[0].values.size:.0f}",
+                    f"{runs[0].error:.1e}",
+                    runs[0].rule,
+                ]
+            )
+    print(
+        f"{device.identity()['name']} ({device.identity()['platform']}), tolerance {TOLERANCE:g}, "
+        f"median of {options.runs} runs"
+    )
     if options.markdown:
         print("| " + " | ".join(head) + " |\n|" + "---|" * len(head))
         print("\n".join("| " + " | ".join(row) + " |" for row in rows))

@@ -5,6 +5,7 @@ number selects one at run time.
 
     python benchmarks/specialize.py [-n RUNS] [--outputs N] [--precision 32|64]
 """
+
 from __future__ import annotations
 
 import argparse
@@ -45,18 +46,29 @@ def switched(per_pair: bool) -> str:
     entries = isotropic()
     given = ", ".join(f"scalar n{k}" for k in range(MOST))
     numbers = ", ".join(f"n{k}" for k in range(MOST))
-    calls = [f"ndf_{e.name}_D(cos_m, sin2_m" + "".join(f", (real)n{k}" for k in range(len(e.passed("NDF_D")))) + ")"
-             for e in entries]
+    calls = [
+        f"ndf_{e.name}_D(cos_m, sin2_m" + "".join(f", (real)n{k}" for k in range(len(e.passed("NDF_D")))) + ")"
+        for e in entries
+    ]
     if per_pair:
         body = "switch (ndf) {" + " ".join(f"case {k}: return {call};" for k, call in enumerate(calls)) + "}"
     else:
         body = " ".join(f"if (ndf == {k}) return {call};" for k, call in enumerate(calls))
-    chosen = (f"static inline real ndf_any_D(real cos_m, real sin2_m, int ndf, {given}) {{ {body} return (real)0; }}\n"
-              f"#define NDF_PARAMETERS , int ndf, {given}\n#define NDF_VALUES , ndf, {numbers}\n"
-              f"#define NDF_SCALARS , const int ndf, {given}\n"
-              f"#define NDF_D_FRONT(a0, a1) ndf_any_D(a0, a1, ndf, {numbers})\n")
-    files = [text_of("real.clh"), text_of("special.clh"), *(text_of(e.kernel_file) for e in entries), chosen,
-             text_of("window.clh"), text_of("lobe.clh"), text_of("prefilter.cl")]
+    chosen = (
+        f"static inline real ndf_any_D(real cos_m, real sin2_m, int ndf, {given}) {{ {body} return (real)0; }}\n"
+        f"#define NDF_PARAMETERS , int ndf, {given}\n#define NDF_VALUES , ndf, {numbers}\n"
+        f"#define NDF_SCALARS , const int ndf, {given}\n"
+        f"#define NDF_D_FRONT(a0, a1) ndf_any_D(a0, a1, ndf, {numbers})\n"
+    )
+    files = [
+        text_of("real.clh"),
+        text_of("special.clh"),
+        *(text_of(e.kernel_file) for e in entries),
+        chosen,
+        text_of("window.clh"),
+        text_of("lobe.clh"),
+        text_of("prefilter.cl"),
+    ]
     return "\n".join(files)
 
 
@@ -101,15 +113,21 @@ def main() -> None:
 
     listed = np.zeros((count, 8), kind)
     listed[:, :3], listed[:, 3:7] = directions(count).T, rng.random((count, 4))
-    out, at, of = device.empty((2, 4, outputs), kind), device.array(directions(outputs).astype(kind)), \
-        device.array(listed)
+    out, at, of = (
+        device.empty((2, 4, outputs), kind),
+        device.array(directions(outputs).astype(kind)),
+        device.array(listed),
+    )
 
     def seconds(kernel: Kernel, last: list[np.generic], sources: int = count) -> float:
         """Return the processor seconds of a launch, or wall seconds on a GPU. Variants take turns to share the load."""
         clock = time.process_time if device.type == "cpu" else time.perf_counter
         begin = clock()
-        device.launch(kernel, (outputs // lanes // device.vectors, 2), (
-            out, np.int32(outputs), np.int32(sources), np.int32(CHUNK), at, of, kind.type(0), kind.type(0), *last))
+        device.launch(
+            kernel,
+            (outputs // lanes // device.vectors, 2),
+            (out, np.int32(outputs), np.int32(sources), np.int32(CHUNK), at, of, kind.type(0), kind.type(0), *last),
+        )
         device.finish()
         return clock() - begin
 
@@ -119,8 +137,10 @@ def main() -> None:
     none = [np.int32(0), *(kind.type(1) for _ in range(MOST))]
     first = isotropic()[0]  # an untimed build first, for the one-time work of the compiler
     built(device, source.convolution(first).text, precision, once([kind.type(x) for x in numbers(device, first)]))
-    general = {name: (text := switched(pair), *built(device, text, precision, once(none)))
-               for name, pair in (("switch", True), ("if", False))}
+    general = {
+        name: (text := switched(pair), *built(device, text, precision, once(none)))
+        for name, pair in (("switch", True), ("if", False))
+    }
     rows = []
     for place, entry in enumerate(isotropic()):
         found = [kind.type(x) for x in numbers(device, entry)]
@@ -133,20 +153,29 @@ def main() -> None:
             seconds(kernel, last)
             values[name] = out.read()
         for name in general:
-            assert np.allclose(values[name], values["own"], rtol=1e-4, atol=1e-4 * np.abs(values["own"]).max()), \
+            assert np.allclose(values[name], values["own"], rtol=1e-4, atol=1e-4 * np.abs(values["own"]).max()), (
                 f"{name} of {entry.name} differs"
+            )
         runs: dict[str, list[float]] = {name: [] for name in variants}
         for _ in range(options.runs):
             for name, (kernel, last) in variants.items():
                 runs[name].append(seconds(kernel, last))
         own_time = min(runs["own"])
-        rows.append([entry.name, f"{1e3 * own_time:.1f}", *(f"{min(runs[n]) / own_time:.2f}"
-                                                            for n in general),
-                     f"{1e3 * build:.0f}", f"{len(text.encode()) / 1e3:.1f}"])
+        rows.append(
+            [
+                entry.name,
+                f"{1e3 * own_time:.1f}",
+                *(f"{min(runs[n]) / own_time:.2f}" for n in general),
+                f"{1e3 * build:.0f}",
+                f"{len(text.encode()) / 1e3:.1f}",
+            ]
+        )
     for name, (text, _, build) in general.items():
         rows.append([f"all, by {name}", "", "", "", f"{1e3 * build:.0f}", f"{len(text.encode()) / 1e3:.1f}"])
-    print(f"{device.identity()['name']} ({device.identity()['platform']}), float{precision}, {outputs} directions × "
-          f"{count} sources, least of {options.runs} launches; × own: times as long as the kernel of this NDF alone")
+    print(
+        f"{device.identity()['name']} ({device.identity()['platform']}), float{precision}, {outputs} directions × "
+        f"{count} sources, least of {options.runs} launches; × own: times as long as the kernel of this NDF alone"
+    )
     for row in [["NDF", "own, ms of CPU", "switch, × own", "if, × own", "build, ms of CPU", "text, kB"], *rows]:
         print("  ".join(cell.ljust(16) for cell in row).rstrip())
 

@@ -1,4 +1,5 @@
 """Pages of three.js, Babylon.js and Filament in headless Chromium, served from loopback: their pixels as floats."""
+
 from __future__ import annotations
 
 import contextlib
@@ -22,9 +23,20 @@ import numpy as np
 
 PAGES = Path(__file__).with_name("engines")
 CHROMIUM = ("chromium", "chromium-browser", "google-chrome-stable", "google-chrome")
-FLAGS = ("--headless", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-quic",
-         "--no-first-run", "--disable-background-networking", "--disable-component-update", "--disable-sync",
-         "--disable-extensions", "--disable-default-apps", "--mute-audio")
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-extensions",
+    "--disable-default-apps",
+    "--mute-audio",
+)
 
 
 def chromium() -> str | None:
@@ -52,8 +64,9 @@ class Answer:
     images: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-def rendered(page: str, jobs: Sequence[Mapping[str, Any]], node_modules: Path, files: Path,
-             timeout: float = 120) -> Answer:
+def rendered(
+    page: str, jobs: Sequence[Mapping[str, Any]], node_modules: Path, files: Path, timeout: float = 120
+) -> Answer:
     """What the page PAGES/`page`.html renders of `jobs`, whose files lie in `files`. Raises PageError."""
     answer, over = Answer(), threading.Event()
     failure: list[str] = []
@@ -80,8 +93,9 @@ def rendered(page: str, jobs: Sequence[Mapping[str, Any]], node_modules: Path, f
             if path is None or ".." in Path(rest).parts or not path.is_file():
                 return self.say(status=404)
             own = {".mjs": "text/javascript", ".js": "text/javascript", ".wasm": "application/wasm"}
-            return self.say(path.read_bytes(), own.get(path.suffix) or mimetypes.guess_type(path)[0]
-                            or "application/octet-stream")
+            return self.say(
+                path.read_bytes(), own.get(path.suffix) or mimetypes.guess_type(path)[0] or "application/octet-stream"
+            )
 
         def do_POST(self) -> None:
             body = self.rfile.read(int(self.headers["Content-Length"]))
@@ -107,7 +121,11 @@ def rendered(page: str, jobs: Sequence[Mapping[str, Any]], node_modules: Path, f
             try:
                 browser = subprocess.Popen(
                     [chromium() or CHROMIUM[0], *FLAGS, f"--user-data-dir={profile}", "--enable-logging=stderr", url],
-                    stdin=subprocess.DEVNULL, stdout=out, stderr=out, start_new_session=True)
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=out,
+                    start_new_session=True,
+                )
             except OSError as error:
                 server.shutdown()
                 server.server_close()
@@ -136,20 +154,53 @@ def glb(meshes: Sequence[Mapping[str, Any]]) -> bytes:
         for name, kind, target in (("positions", "<f4", 34962), ("normals", "<f4", 34962), ("indices", "<u4", 34963)):
             array = np.asarray(mesh[name], kind).reshape(-1, 1 if name == "indices" else 3)
             views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": array.nbytes, "target": target})
-            accessors.append({"bufferView": len(views) - 1, "count": len(array),
-                              "componentType": 5125 if name == "indices" else 5126,
-                              "type": "SCALAR" if name == "indices" else "VEC3"}
-                             | ({"min": array.min(0).tolist(), "max": array.max(0).tolist()}
-                                if name == "positions" else {}))
+            accessors.append(
+                {
+                    "bufferView": len(views) - 1,
+                    "count": len(array),
+                    "componentType": 5125 if name == "indices" else 5126,
+                    "type": "SCALAR" if name == "indices" else "VEC3",
+                }
+                | ({"min": array.min(0).tolist(), "max": array.max(0).tolist()} if name == "positions" else {})
+            )
             blob += array.tobytes()
-        materials.append({"doubleSided": True, "pbrMetallicRoughness": {
-            "baseColorFactor": [*mesh["color"], 1], "metallicFactor": mesh["metallic"],
-            "roughnessFactor": mesh["roughness"]}})
-        made.append({"primitives": [{"attributes": {"POSITION": 3 * k, "NORMAL": 3 * k + 1}, "indices": 3 * k + 2,
-                                     "material": k}]})
-    text = json.dumps({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": list(range(len(made)))}],
-                       "nodes": [{"mesh": k} for k in range(len(made))], "meshes": made, "materials": materials,
-                       "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(blob)}]}).encode()
+        materials.append(
+            {
+                "doubleSided": True,
+                "pbrMetallicRoughness": {
+                    "baseColorFactor": [*mesh["color"], 1],
+                    "metallicFactor": mesh["metallic"],
+                    "roughnessFactor": mesh["roughness"],
+                },
+            }
+        )
+        made.append(
+            {
+                "primitives": [
+                    {"attributes": {"POSITION": 3 * k, "NORMAL": 3 * k + 1}, "indices": 3 * k + 2, "material": k}
+                ]
+            }
+        )
+    text = json.dumps(
+        {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": list(range(len(made)))}],
+            "nodes": [{"mesh": k} for k in range(len(made))],
+            "meshes": made,
+            "materials": materials,
+            "accessors": accessors,
+            "bufferViews": views,
+            "buffers": [{"byteLength": len(blob)}],
+        }
+    ).encode()
     text += b" " * (-len(text) % 4)
-    return b"".join((struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob)),
-                     struct.pack("<I4s", len(text), b"JSON"), text, struct.pack("<I4s", len(blob), b"BIN\0"), blob))
+    return b"".join(
+        (
+            struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(blob)),
+            struct.pack("<I4s", len(text), b"JSON"),
+            text,
+            struct.pack("<I4s", len(blob), b"BIN\0"),
+            blob,
+        )
+    )

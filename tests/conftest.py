@@ -1,4 +1,5 @@
 """Fixtures for all tests: every OpenCL device that works, and the environments the machine offers."""
+
 from __future__ import annotations
 
 import collections
@@ -71,7 +72,8 @@ def working_devices() -> dict[str, Candidate]:
     """Every device whose probe gave the right answer, under a name fit for a test id."""
     return {
         f"{c.index}-" + re.sub(r"[^a-z0-9]+", "-", f"{c.platform} {c.name}".lower()).strip("-"): c
-        for c in find_devices() if c.works
+        for c in find_devices()
+        if c.works
     }
 
 

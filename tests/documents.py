@@ -3,6 +3,7 @@
 `python tests/documents.py` writes the generated blocks of the documents anew. Needs neither pytest nor any extra but
 for that: the plain install is tried with it.
 """
+
 from __future__ import annotations
 
 import ast
@@ -50,8 +51,11 @@ def pages() -> list[Path]:
 
 def blocks(language: str) -> list[Block]:
     """The fenced blocks of a language, page by page."""
-    return [Block(page.relative_to(ROOT).as_posix(), language, text) for page in pages()
-            for text in re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)]
+    return [
+        Block(page.relative_to(ROOT).as_posix(), language, text)
+        for page in pages()
+        for text in re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+    ]
 
 
 def python_blocks() -> list[Block]:
@@ -96,7 +100,7 @@ def shortened(line: Line) -> list[str]:
     if "--size" not in arguments:
         return [*arguments, "--size", str(LARGEST)]
     at = arguments.index("--size") + 1
-    return [*arguments[:at], str(min(int(arguments[at]), LARGEST)), *arguments[at + 1:]]
+    return [*arguments[:at], str(min(int(arguments[at]), LARGEST)), *arguments[at + 1 :]]
 
 
 def needed(line: Line) -> list[str] | None:
@@ -155,8 +159,11 @@ def generated(folder: Path) -> Iterator[tuple[str, str, str]]:
     yield "docs/add-a-model.md", "diff", added.strip("\n")
     yield "docs/add-an-engine.md", "preset", (ROOT / PRESET).read_text("utf-8").strip("\n")
     tree = ast.parse((ROOT / "tests/tables/test_kinds.py").read_text("utf-8"))
-    (kind,) = (ast.literal_eval(node.value) for node in tree.body if isinstance(node, ast.Assign)
-               and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "NEW_KIND")
+    (kind,) = (
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name) and node.targets[0].id == "NEW_KIND"
+    )
     yield "docs/add-a-table.md", "kind", kind.strip("\n")
 
 

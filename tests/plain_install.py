@@ -3,6 +3,7 @@
 Every command's help, every command line and Python block of the documents on small inputs, and every public function:
 each ends well, or with the one sentence that names the extra it needs, before it computes anything.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -16,8 +17,13 @@ import time
 import traceback
 from pathlib import Path
 
-EXTRAS = {"astc": "astc_encoder", "bc6h": "ispc_texcomp", "dask": "distributed", "plot": "matplotlib",
-          "scene": "pygltflib"}
+EXTRAS = {
+    "astc": "astc_encoder",
+    "bc6h": "ispc_texcomp",
+    "dask": "distributed",
+    "plot": "matplotlib",
+    "scene": "pygltflib",
+}
 NAMES_AN_EXTRA = re.compile(r"""pip install ["']?whitefurnace\[(\w+)\]["']?""")
 UNSUPPORTED = 5  # the exit code of what an installation cannot do
 PROMPT = 5.0  # seconds in which a missing extra is found; a bake of the documents computes for longer

@@ -1,4 +1,5 @@
 """A small call of every public function. Needs neither pytest nor any extra: the plain install is tested with it."""
+
 from __future__ import annotations
 
 import importlib

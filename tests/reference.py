@@ -1,5 +1,6 @@
 """Float64 truths for tests, in NumPy and in other forms than the kernels: lobes over environments, GGX's albedo
 with the azimuth in closed form, the albedo of any models over light directions by tanh-sinh."""
+
 from __future__ import annotations
 
 import math
@@ -36,12 +37,14 @@ def texel_nodes(texels: np.ndarray, rotation: float, cuts: int) -> tuple[np.ndar
     x, w = gauss(cuts)
     if texels.ndim == 3:
         rows, columns = texels.shape[:2]
-        theta, phi = ((np.arange(k)[:, None] + x).ravel() * (span / k) for k, span in
-                      ((rows, math.pi), (columns, 2 * math.pi)))
+        theta, phi = (
+            (np.arange(k)[:, None] + x).ravel() * (span / k) for k, span in ((rows, math.pi), (columns, 2 * math.pi))
+        )
         phi = phi - math.pi
         i, j = np.repeat(np.arange(rows), cuts), np.repeat(np.arange(columns), cuts)
-        weight = np.outer(np.tile(w, rows) * np.sin(theta) * math.pi / rows,
-                          np.tile(w, columns) * 2 * math.pi / columns)
+        weight = np.outer(
+            np.tile(w, rows) * np.sin(theta) * math.pi / rows, np.tile(w, columns) * 2 * math.pi / columns
+        )
         y = np.broadcast_to(np.cos(theta)[:, None], weight.shape)
         d = np.stack([np.outer(np.sin(theta), np.cos(phi)), y, np.outer(np.sin(theta), np.sin(phi))], -1)
         index = i[:, None] * columns + j
@@ -104,8 +107,7 @@ def ggx_lobe_norm(alpha: float) -> float:
 # ------------------------------------------------------------------------------------- GGX, 1-D
 
 
-def ggx_albedo_1d(NoV: np.ndarray, alpha: np.ndarray, n: int = 96,
-                  azimuths: int = 80) -> tuple[np.ndarray, np.ndarray]:
+def ggx_albedo_1d(NoV: np.ndarray, alpha: np.ndarray, n: int = 96, azimuths: int = 80) -> tuple[np.ndarray, np.ndarray]:
     """(E, Fc): albedo of GGX with height-correlated Smith and F = 1, and its Schlick part, (cells,) float64 each.
 
     Over l, not over half vectors. At fixed l.z the masking does not depend on azimuth and D is rational in
@@ -180,9 +182,15 @@ def smith_area(D: Callable[[np.ndarray], np.ndarray], up: np.ndarray, step: floa
     return total
 
 
-def albedo_by_tanh_sinh(D: Callable[..., np.ndarray], V: Callable[..., np.ndarray],
-                        F: Callable[[np.ndarray], np.ndarray], area: Callable[..., np.ndarray], NoV: float,
-                        phi_v: float | None = None, step: float = 1 / 16) -> float:
+def albedo_by_tanh_sinh(
+    D: Callable[..., np.ndarray],
+    V: Callable[..., np.ndarray],
+    F: Callable[[np.ndarray], np.ndarray],
+    area: Callable[..., np.ndarray],
+    NoV: float,
+    phi_v: float | None = None,
+    step: float = 1 / 16,
+) -> float:
     """E = ∫ F(v·h) D(h) V/4 (n·l) dω_l over light directions, by tanh-sinh panels in θ_l that meet at the view's angle
     and in the azimuth that meet at the mirror direction's and opposite to it: whatever the lobe's width, its peak is
     where panels meet.
@@ -221,8 +229,15 @@ def albedo_by_tanh_sinh(D: Callable[..., np.ndarray], V: Callable[..., np.ndarra
 # ------------------------------------------------------------------------------------- any lobe, graded
 
 
-def graded_lobe(texels: np.ndarray, rotation: float, direction: np.ndarray, density: Callable[[np.ndarray], np.ndarray],
-                width: float, slope: float, tolerance: float = 1e-6) -> np.ndarray:
+def graded_lobe(
+    texels: np.ndarray,
+    rotation: float,
+    direction: np.ndarray,
+    density: Callable[[np.ndarray], np.ndarray],
+    width: float,
+    slope: float,
+    tolerance: float = 1e-6,
+) -> np.ndarray:
     """∫ L K dω/∫ K dω in one direction (3,): (3,) float64, for any lobe K = D(q)(1 - q/2)₊, q = |l - r|².
 
     Texels are halved until each cell is smaller than 0.4 of its distance to r or of `width`, D's own scale, and takes

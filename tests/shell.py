@@ -1,4 +1,5 @@
 """Runs command lines in this process or names them for one of their own; looks at the folders they leave."""
+
 from __future__ import annotations
 
 import contextlib
@@ -52,7 +53,8 @@ def mounted(folder: Path, *options: str):
     """A tmpfs, where this user may mount one."""
     folder.mkdir(exist_ok=True)
     tried = shutil.which("mount") and subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(folder)], capture_output=True)
+        ["mount", "-t", "tmpfs", "-o", ",".join(options), "tmpfs", str(folder)], capture_output=True
+    )
     if not tried or tried.returncode:
         pytest.skip("only root with the right to mount can make a small file system")
     try:

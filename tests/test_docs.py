@@ -1,4 +1,5 @@
 """The documents are true: their commands and their Python run, their generated parts are what the program says."""
+
 from __future__ import annotations
 
 import contextlib
@@ -46,13 +47,21 @@ def test_there_are_commands_to_test():
     assert len(documents.commands()) >= 50 and len(documents.python_blocks()) >= 3
 
 
-LONG = ("whitefurnace bake forest_1k.exr -o mine", "whitefurnace bake studio.hdr -o baked --as-read",
-        "whitefurnace bake studio.hdr -o baked --fit read", "whitefurnace bake studio.hdr -o baked --ndf",
-        "whitefurnace bake studio.hdr -o baked --tolerance 1e-4 --certify", "whitefurnace batch probes.toml --shard",
-        "whitefurnace bench ", "whitefurnace lut energy -o turquin", "whitefurnace lut ltc_1",
-        "whitefurnace render baked/demo.json --for filament",
-        "whitefurnace scene helmet.glb --for filament --environment", "whitefurnace verify hat.clh",
-        "whitefurnace verify smith")
+LONG = (
+    "whitefurnace bake forest_1k.exr -o mine",
+    "whitefurnace bake studio.hdr -o baked --as-read",
+    "whitefurnace bake studio.hdr -o baked --fit read",
+    "whitefurnace bake studio.hdr -o baked --ndf",
+    "whitefurnace bake studio.hdr -o baked --tolerance 1e-4 --certify",
+    "whitefurnace batch probes.toml --shard",
+    "whitefurnace bench ",
+    "whitefurnace lut energy -o turquin",
+    "whitefurnace lut ltc_1",
+    "whitefurnace render baked/demo.json --for filament",
+    "whitefurnace scene helmet.glb --for filament --environment",
+    "whitefurnace verify hat.clh",
+    "whitefurnace verify smith",
+)
 """Lines that compute for more than some seconds, however small their input."""
 
 
@@ -62,8 +71,13 @@ def is_long(line: documents.Line) -> bool:
     return line.text.startswith(LONG) or of_an_engine is not None
 
 
-@pytest.mark.parametrize("line", [pytest.param(line, id=line.text, marks=pytest.mark.long if is_long(line) else ())
-                                  for line in documents.commands()])
+@pytest.mark.parametrize(
+    "line",
+    [
+        pytest.param(line, id=line.text, marks=pytest.mark.long if is_long(line) else ())
+        for line in documents.commands()
+    ],
+)
 def test_a_command_of_the_documents_runs(line, folder):
     if before := documents.needed(line):
         assert run(*before, cwd=folder).returncode == 0
@@ -176,10 +190,12 @@ def test_every_page_begins_with_a_command():
 
 def test_help_is_quick_to_import():
     # numpy, OpenCL and the image library cost .1 to .3 s each: help needs none of them.
-    script = ("import sys\nfrom whitefurnace.cli import main\n"
-              "try: main(['bake', '--help'])\nexcept SystemExit: pass\n"
-              "heavy = {'numpy', 'pyopencl', 'OpenImageIO', 'rich'} & set(sys.modules)\n"
-              "sys.exit(f'imported {heavy}' if heavy else 0)")
+    script = (
+        "import sys\nfrom whitefurnace.cli import main\n"
+        "try: main(['bake', '--help'])\nexcept SystemExit: pass\n"
+        "heavy = {'numpy', 'pyopencl', 'OpenImageIO', 'rich'} & set(sys.modules)\n"
+        "sys.exit(f'imported {heavy}' if heavy else 0)"
+    )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

@@ -1,4 +1,5 @@
 """Rules of the house that no linter knows: the length of functions, and that run-time imports are declared."""
+
 from __future__ import annotations
 
 import ast
@@ -42,11 +43,19 @@ def test_every_run_time_import_is_declared():
     missing = set()
     for path in (ROOT / "host").rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else \
-                [node.module or ""] if isinstance(node, ast.ImportFrom) and not node.level else []
+            names = (
+                [alias.name for alias in node.names]
+                if isinstance(node, ast.Import)
+                else [node.module or ""]
+                if isinstance(node, ast.ImportFrom) and not node.level
+                else []
+            )
             for name in names:
                 top = name.partition(".")[0]
-                if top not in sys.stdlib_module_names and top != "whitefurnace" and \
-                        DISTRIBUTIONS.get(top, top).lower() not in declared:
+                if (
+                    top not in sys.stdlib_module_names
+                    and top != "whitefurnace"
+                    and DISTRIBUTIONS.get(top, top).lower() not in declared
+                ):
                     missing.add(f"{top} ({path.relative_to(ROOT)})")
     assert not missing, f"imported at run time and not declared in setup.cfg: {sorted(missing)}"

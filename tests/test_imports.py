@@ -1,4 +1,5 @@
 """Imports point one way and each outside library has one door: this keeps the packages of the house apart."""
+
 from __future__ import annotations
 
 import ast
@@ -103,7 +104,7 @@ def test_no_modules_import_each_other():
     done: set[str] = set()
 
     def visit(name: str, way: tuple[str, ...]) -> None:
-        assert name not in way, " imports ".join([*way[way.index(name):], name])
+        assert name not in way, " imports ".join([*way[way.index(name) :], name])
         if name not in done:
             for target in sorted(arrows[name]):
                 visit(target, (*way, name))
@@ -117,11 +118,19 @@ def test_the_check_sees_every_form_of_import(tmp_path, monkeypatch):
     monkeypatch.setattr(f"{__name__}.HOST", tmp_path)
     module = tmp_path / "files" / "one.py"
     module.parent.mkdir()
-    module.write_text("import scipy.special\nfrom ..device import x\nfrom . import two\nfrom .. import run\n"
-                      "def f():\n    from whitefurnace import cli\n    import whitefurnace.plan as p\n")
+    module.write_text(
+        "import scipy.special\nfrom ..device import x\nfrom . import two\nfrom .. import run\n"
+        "def f():\n    from whitefurnace import cli\n    import whitefurnace.plan as p\n"
+    )
     (tmp_path / "run.py").touch()
     names = {name for _, name in imports(module)}
-    assert names == {"scipy.special", "whitefurnace.device.x", "whitefurnace.files.two", "whitefurnace.run",
-                     "whitefurnace.cli", "whitefurnace.plan"}
+    assert names == {
+        "scipy.special",
+        "whitefurnace.device.x",
+        "whitefurnace.files.two",
+        "whitefurnace.run",
+        "whitefurnace.cli",
+        "whitefurnace.plan",
+    }
     assert imported_room("whitefurnace.run") == "run" and imported_room("whitefurnace.files.two") == "files"
     assert imported_room("whitefurnace.integrate") == imported_room("whitefurnace") == "__init__"

@@ -1,4 +1,5 @@
 """The package is whole: setup.cfg's list is the tree, and what is installed has every module and kernel."""
+
 from __future__ import annotations
 
 import configparser
@@ -51,11 +52,15 @@ def test_every_kernel_file_is_package_data():
 @pytest.mark.skipif(INSTALLED == HOST, reason="runs from the tree, not from an installed wheel")
 def test_the_wheel_has_all_files_and_no_others():
     def files(folder: Path, *suffixes: str) -> dict[str, bytes]:
-        return {path.relative_to(folder).as_posix(): path.read_bytes()
-                for path in folder.rglob("*") if path.suffix in suffixes and "__pycache__" not in path.parts}
+        return {
+            path.relative_to(folder).as_posix(): path.read_bytes()
+            for path in folder.rglob("*")
+            if path.suffix in suffixes and "__pycache__" not in path.parts
+        }
 
-    wanted = files(HOST, ".py", ".html") | {f"kernels/{name}": text
-                                   for name, text in files(KERNELS, ".py", ".cl", ".clh").items()}
+    wanted = files(HOST, ".py", ".html") | {
+        f"kernels/{name}": text for name, text in files(KERNELS, ".py", ".cl", ".clh").items()
+    }
     there = files(INSTALLED, ".py", ".html", ".cl", ".clh")
     assert set(there) == set(wanted)
     assert [name for name in wanted if there[name] != wanted[name]] == [], "an old wheel is installed"

@@ -1,4 +1,5 @@
 """Uses the public names as a project of somebody else would; `make lint` checks that mypy knows their types."""
+
 from __future__ import annotations
 
 from typing import assert_type

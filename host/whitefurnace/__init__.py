@@ -5,6 +5,7 @@
 
 The names below are the public interface; OpenCL and image libraries are imported at their first use.
 """
+
 from __future__ import annotations
 
 import importlib
@@ -27,8 +28,19 @@ _HOMES = {
     "without_sun": "sphere.suns",
 }
 
-__all__ = ["__version__", "bake", "dfg", "environment", "harmonics", "integrate", "irradiance", "lut", "prefilter",
-           "sample", "without_sun"]
+__all__ = [
+    "__version__",
+    "bake",
+    "dfg",
+    "environment",
+    "harmonics",
+    "integrate",
+    "irradiance",
+    "lut",
+    "prefilter",
+    "sample",
+    "without_sun",
+]
 
 if TYPE_CHECKING:
     from whitefurnace.baking.bake import bake

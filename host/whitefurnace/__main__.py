@@ -1,4 +1,5 @@
 """`python -m whitefurnace`."""
+
 from whitefurnace.cli import main
 
 main()

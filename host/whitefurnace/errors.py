@@ -2,6 +2,7 @@
 
 A message names the wrong value and its place, and gives the allowed range or the nearest known name.
 """
+
 from __future__ import annotations
 
 import difflib

@@ -2,6 +2,7 @@
 
 numpy evaluates the same text that is translated to GLSL, HLSL and WGSL, so the bake and the shader agree.
 """
+
 from __future__ import annotations
 
 import ast
@@ -109,7 +110,8 @@ class Expression:
                 self._check(left)
                 return self._check(right)
             case ast.IfExp(test=ast.Compare(left=left, ops=[op], comparators=[right]), body=body, orelse=other) if (
-                    type(op) in _COMPARE):
+                type(op) in _COMPARE
+            ):
                 for part in (left, right, body, other):
                     self._check(part)
                 return
@@ -121,8 +123,10 @@ class Expression:
                 for part in args:
                     self._check(part)
                 return
-        raise UsageError(f"{self.where}: {self.text!r} is no formula of numbers, {', '.join(self.names)}, "
-                         f"+ - * / ** and {', '.join(FUNCTIONS)}")
+        raise UsageError(
+            f"{self.where}: {self.text!r} is no formula of numbers, {', '.join(self.names)}, "
+            f"+ - * / ** and {', '.join(FUNCTIONS)}"
+        )
 
     def _value(self, node: ast.AST, names: Mapping[str, Any]) -> Any:
         match node:
@@ -134,13 +138,28 @@ class Expression:
                 return -self._value(operand, names) if isinstance(op, ast.USub) else self._value(operand, names)
             case ast.BinOp(left=left, op=op, right=right):
                 a, b = self._value(left, names), self._value(right, names)
-                return (a + b if isinstance(op, ast.Add) else a - b if isinstance(op, ast.Sub) else
-                        a * b if isinstance(op, ast.Mult) else np.divide(a, b) if isinstance(op, ast.Div) else
-                        np.power(a, b))
+                return (
+                    a + b
+                    if isinstance(op, ast.Add)
+                    else a - b
+                    if isinstance(op, ast.Sub)
+                    else a * b
+                    if isinstance(op, ast.Mult)
+                    else np.divide(a, b)
+                    if isinstance(op, ast.Div)
+                    else np.power(a, b)
+                )
             case ast.IfExp(test=ast.Compare(left=left, ops=[op], comparators=[right]), body=body, orelse=other):
                 a, b = self._value(left, names), self._value(right, names)
-                test = (a < b if isinstance(op, ast.Lt) else a <= b if isinstance(op, ast.LtE) else
-                        a > b if isinstance(op, ast.Gt) else a >= b)
+                test = (
+                    a < b
+                    if isinstance(op, ast.Lt)
+                    else a <= b
+                    if isinstance(op, ast.LtE)
+                    else a > b
+                    if isinstance(op, ast.Gt)
+                    else a >= b
+                )
                 return np.where(test, self._value(body, names), self._value(other, names))
             case ast.Call(func=ast.Name(id=name), args=args):
                 return FUNCTIONS[name][1](*(self._value(part, names) for part in args))

@@ -2,6 +2,7 @@
 
 Only this module imports matplotlib.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -58,8 +59,13 @@ def require() -> None:
 
 
 @contextlib.contextmanager
-def drawing(path: Path, *, dpi: int | None = None, size: tuple[float, float] | None = None,
-            stated: Mapping[str, str] | None = None) -> Iterator[Figure]:
+def drawing(
+    path: Path,
+    *,
+    dpi: int | None = None,
+    size: tuple[float, float] | None = None,
+    stated: Mapping[str, str] | None = None,
+) -> Iterator[Figure]:
     """Give an empty figure in the common style and write it to `path` as PNG when the block ends.
 
     The same drawing gives the same bytes; the matplotlibrc of the machine is ignored.
@@ -198,9 +204,15 @@ def add_legend(axes: Axes, title: str = "", inside: str | tuple[float, float] | 
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         inch = axes.figure.dpi / axes.bbox.width
-        place: dict[str, Any] = {"loc": inside} if inside else {
-            "loc": "upper left", "borderaxespad": 0,
-            "bbox_to_anchor": (1 + 0.12 * inch, 0.75 if axes.name == "polar" else 1.0)}  # half a disc ends at .75
+        place: dict[str, Any] = (
+            {"loc": inside}
+            if inside
+            else {
+                "loc": "upper left",
+                "borderaxespad": 0,
+                "bbox_to_anchor": (1 + 0.12 * inch, 0.75 if axes.name == "polar" else 1.0),
+            }
+        )  # half a disc ends at .75
         legend = axes.legend(handles, labels, title=title or None, alignment="left", **place)
         legend.get_title().set_color("0.35")
 

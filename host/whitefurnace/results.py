@@ -1,4 +1,5 @@
 """The result type of integrals: an array with its estimated error."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, field

@@ -1,4 +1,5 @@
 """Text for terminals and pages: aligned tables and sizes in bytes."""
+
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence

@@ -1,4 +1,5 @@
 """The version of the installed package: it stands once, in setup.cfg."""
+
 from __future__ import annotations
 
 from importlib.metadata import PackageNotFoundError, version

@@ -1,4 +1,5 @@
 """The error budget of a scene: against closed forms, other quadratures and the files of a real bake."""
+
 from __future__ import annotations
 
 import itertools
@@ -43,9 +44,10 @@ def scene_of(folder: Path, *materials: Mapping[str, Any], images: list[np.ndarra
 
 
 def plain(color: tuple[float, float, float], metal: float, roughness: float, **extensions: Any) -> dict[str, Any]:
-    return {"pbrMetallicRoughness": {"baseColorFactor": [*color, 1], "metallicFactor": metal,
-                                     "roughnessFactor": roughness},
-            "extensions": {f"KHR_materials_{name}": value for name, value in extensions.items()}}
+    return {
+        "pbrMetallicRoughness": {"baseColorFactor": [*color, 1], "metallicFactor": metal, "roughnessFactor": roughness},
+        "extensions": {f"KHR_materials_{name}": value for name, value in extensions.items()},
+    }
 
 
 WHITE = (1.0, 1.0, 1.0)
@@ -59,8 +61,11 @@ def lobed() -> Environment:
     d = directions(texels)
     for sharp in (300.0, 30.0, 4.0):
         axis = rng.normal(size=3)
-        texels += (np.exp(sharp * (d @ (axis / np.linalg.norm(axis)) - 1))[..., None] *
-                   rng.uniform(0.2, 1, 3) * math.sqrt(sharp)).astype(np.float32)
+        texels += (
+            np.exp(sharp * (d @ (axis / np.linalg.norm(axis)) - 1))[..., None]
+            * rng.uniform(0.2, 1, 3)
+            * math.sqrt(sharp)
+        ).astype(np.float32)
     return environment(texels)
 
 
@@ -77,8 +82,13 @@ def directions(texels: np.ndarray) -> np.ndarray:
 def test_constant_light_leaves_only_the_model(device, tmp_path):
     """Every mean of constant light is that light: what the files and the split sum add is rounding. b10g11r11 and half
     floats hold 1 exactly; float32 sums of some 10⁴ terms keep 1e-5."""
-    meter = ErrorMeter(scene_of(tmp_path, *MIXED), environment(np.ones((16, 32, 3), np.float32)), ENGINES["filament"],
-                       device, count=COUNT)
+    meter = ErrorMeter(
+        scene_of(tmp_path, *MIXED),
+        environment(np.ones((16, 32, 3), np.float32)),
+        ENGINES["filament"],
+        device,
+        count=COUNT,
+    )
     found = meter.budget(chain(size=32, min_size=8))
     for name in ("texels", "roughness", "format", "diffuse", "n = v = r", "F·G from L", "split sum"):
         assert found[name].rms < 2e-5, (name, found[name])
@@ -122,8 +132,12 @@ def test_a_rough_metal_in_linear_light(device, tmp_path):
         assert np.quantile(np.abs(got / want - 1), 0.95) < ACCURACY, np.abs(got / want - 1).max()
     assert np.allclose(meter.integrals.exact_table[0] + meter.integrals.exact_table[1], E[:, 0], atol=2e-5)
     # raw gives nothing back: the split sum weighs by E, what is right has the mean itself
-    for name, difference in (("n = v = r", E * (levels - own_view)), ("F·G from L", E * (own_view - seen)),
-                             ("split sum", E * (levels - seen)), ("energy", (E - 1) * seen)):
+    for name, difference in (
+        ("n = v = r", E * (levels - own_view)),
+        ("F·G from L", E * (own_view - seen)),
+        ("split sum", E * (levels - seen)),
+        ("energy", (E - 1) * seen),
+    ):
         off = texel_errors(seen + difference, seen, float(seen.mean()))
         got = next(e for e in (*meter.split, *meter.model) if e.name == name)
         assert got.rms == pytest.approx(float(np.sqrt((off * off).mean())), rel=0.01), name
@@ -161,8 +175,13 @@ def test_fresnel_against_a_quadrature(device, tmp_path):
     """A black insulator of α = 1 in constant light shows its albedo: ∫ F(v·h) (n·l)/(2π (n·l + n·v)) dω, by nodes of
     Gauss in n·l and equal ones in azimuth, with the catalogue's float64 Fresnel terms."""
     ior = 2.2
-    meter = ErrorMeter(scene_of(tmp_path, plain((0, 0, 0), 0, 1, ior={"ior": ior})),
-                       environment(np.ones((16, 32, 3), np.float32)), ENGINES["filament"], device, count=48)
+    meter = ErrorMeter(
+        scene_of(tmp_path, plain((0, 0, 0), 0, 1, ior={"ior": ior})),
+        environment(np.ones((16, 32, 3), np.float32)),
+        ENGINES["filament"],
+        device,
+        count=48,
+    )
     x, w = np.polynomial.legendre.leggauss(96)
     mu, w = (x + 1) / 2, w / 2
     phi = (np.arange(96) + 0.5) / 96 * math.pi
@@ -172,9 +191,13 @@ def test_fresnel_against_a_quadrature(device, tmp_path):
     weight = (w * mu)[:, None] / (mu[:, None] + c) / len(phi)
     f0 = ((ior - 1) / (ior + 1)) ** 2
     one = weight.sum((1, 2)) * len(phi)
-    exact, schlick = ((weight * F).sum((1, 2)) * (1 + f0 * (1 / one - 1)) for F in (
-        model("fresnel", "dielectric").reference["F"](VoH, ior),
-        model("fresnel", "schlick").reference["F"](VoH, f0, 1)))
+    exact, schlick = (
+        (weight * F).sum((1, 2)) * (1 + f0 * (1 / one - 1))
+        for F in (
+            model("fresnel", "dielectric").reference["F"](VoH, ior),
+            model("fresnel", "schlick").reference["F"](VoH, f0, 1),
+        )
+    )
     assert np.allclose(meter.right, exact[:, None], rtol=1e-4)
     off = texel_errors(np.repeat(schlick[:, None], 3, 1), np.repeat(exact[:, None], 3, 1), float(exact.mean()))
     assert meter.model[1].rms == pytest.approx(float(np.sqrt((off * off).mean())), rel=2e-3)
@@ -194,8 +217,13 @@ def test_other_ways_in_constant_light(device, tmp_path):
     assert not rough.integrals.grooved().any()  # metal has no diffuse
     color, r = (0.8, 0.5, 0.2), 0.7
     matte = ErrorMeter(scene_of(tmp_path, plain(color, 0, r)), env, ENGINES["raw"], device, count=48)
-    want = integrate("albedo", diffuse="oren_nayar", NoV=matte.points.NoV[:, None], albedo=np.array(color),
-                     sigma=math.atan(r * r / math.sqrt(2))).values - np.array(color)
+    want = integrate(
+        "albedo",
+        diffuse="oren_nayar",
+        NoV=matte.points.NoV[:, None],
+        albedo=np.array(color),
+        sigma=math.atan(r * r / math.sqrt(2)),
+    ).values - np.array(color)
     rest = 1 - matte.integrals.reflected(matte.sampled.f0)[1]
     assert np.allclose(matte.integrals.grooved(), rest * want, atol=2e-4)
 
@@ -252,8 +280,12 @@ def test_a_worse_cause_has_a_larger_effect(meter):
         form, size = options.pop("form", None), options.pop("table", None)
         engine = meter.engine if size is None else reduced(meter.engine, (), size)
         if form:
-            engine = msgspec.structs.replace(engine, file=tuple(
-                msgspec.structs.replace(f, format=form) if f.holds == "specular" else f for f in engine.file))
+            engine = msgspec.structs.replace(
+                engine,
+                file=tuple(
+                    msgspec.structs.replace(f, format=form) if f.holds == "specular" else f for f in engine.file
+                ),
+            )
         return meter.budget(chain(**{"size": 64, **options}), engine)[part].rms
 
     tables = [of("table", table=n) for n in (8, 32, 128)]
@@ -295,8 +327,9 @@ def test_raw_may_have_harmonics(device, tmp_path):
     """Light of degree 1 is exactly in nine harmonics: they are cheaper than a cube."""
     texels = np.zeros((64, 128, 3), np.float32)
     texels[:] = (1 + directions(texels) @ [0.3, 0.5, 0.2])[..., None]
-    meter = ErrorMeter(scene_of(tmp_path, plain((0.8, 0.8, 0.8), 0, 0.9)), environment(texels), ENGINES["raw"], device,
-                       count=COUNT)
+    meter = ErrorMeter(
+        scene_of(tmp_path, plain((0.8, 0.8, 0.8), 0, 0.9)), environment(texels), ENGINES["raw"], device, count=COUNT
+    )
     choice = choose(meter, 0.05, usual(ENGINES["raw"]))
     assert choice.met and choice.options["without"] == ["irradiance"]
     # of an engine without harmonics there is no such choice
@@ -354,8 +387,10 @@ def test_the_command_tells_and_bakes(device, tmp_path, capsys):
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     (whole,), (choice,) = ([row for row in rows if row["event"] == event] for event in ("budget", "choice"))
     named = {row["name"]: row for row in rows if row["event"] == "approximation"}
-    assert whole["largest"] == max((row for row in named.values() if row["used"] and not row["bound"]),
-                                   key=lambda row: row["rms"])["name"]
+    assert (
+        whole["largest"]
+        == max((row for row in named.values() if row["used"] and not row["bound"]), key=lambda row: row["rms"])["name"]
+    )
     assert choice["met"] and choice["error"] <= 0.2
     manifest = json.loads((tmp_path / "out" / "sky.json").read_text())
     assert manifest["levels"][0]["size"] == choice["options"].get("size", 256)

@@ -1,5 +1,6 @@
 """`bake` from end to end, as a command and from Python: what it writes, what it refuses, and that it never leaves
 anything half-written."""
+
 from __future__ import annotations
 
 import contextlib
@@ -171,7 +172,7 @@ def test_manifest_proves_the_rest(coded):
     # curvature, for 8² faces and degree 1, which sums to 0 over opposite texels but for rounding.
     assert energy == pytest.approx([1, 1, 1], abs=1e-5)
     text = json.dumps(manifest)
-    assert not any(word in text for word in ("seconds", "date", "time\"")), "a manifest holds no times"
+    assert not any(word in text for word in ("seconds", "date", 'time"')), "a manifest holds no times"
 
 
 def test_a_second_bake_elsewhere_gives_the_same_bytes(coded, tmp_path):
@@ -227,8 +228,18 @@ def test_a_second_run_skips_and_another_option_replaces(tmp_path, shell):
     verified(out)
 
 
-@pytest.mark.parametrize("option", [("--size", "16"), ("--min-size", "16"), ("--rotate", "10"), ("--exposure", ".5"),
-                                    ("--tolerance", "2e-3"), ("--nonfinite", "zero"), ("--for", "raw,exr")])
+@pytest.mark.parametrize(
+    "option",
+    [
+        ("--size", "16"),
+        ("--min-size", "16"),
+        ("--rotate", "10"),
+        ("--exposure", ".5"),
+        ("--tolerance", "2e-3"),
+        ("--nonfinite", "zero"),
+        ("--for", "raw,exr"),
+    ],
+)
 def test_every_option_that_changes_the_output_changes_the_key(tmp_path, shell, option):
     source = image(tmp_path / "a.exr", noise(height=4))
     keys = []
@@ -290,14 +301,17 @@ def test_a_file_that_is_gone_is_made_again(tmp_path, shell):
     assert tree(out) == before
 
 
-@pytest.mark.parametrize("manifest", [
-    '{"whitefurnace": "0", "name": "a"}',
-    '{"whitefurnace": "0", "name": "a", "files": [1]}',
-    '{"whitefurnace": "0", "name": "a", "files": {"raw/a.npz": "x"}}',
-    '{"whitefurnace": "0", "name": "b", "files": {}}',
-    "[]",
-    "{",
-])
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        '{"whitefurnace": "0", "name": "a"}',
+        '{"whitefurnace": "0", "name": "a", "files": [1]}',
+        '{"whitefurnace": "0", "name": "a", "files": {"raw/a.npz": "x"}}',
+        '{"whitefurnace": "0", "name": "b", "files": {}}',
+        "[]",
+        "{",
+    ],
+)
 def test_a_damaged_manifest_proves_nothing(tmp_path, shell, manifest):
     source, out = image(tmp_path / "a.exr", noise()), tmp_path / "out"
     (out / "raw").mkdir(parents=True)
@@ -358,17 +372,32 @@ def test_quiet_prints_nothing(tmp_path, shell):
     assert shell.out == "" and shell.sentence()
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (("--for", "rwa"), ("rwa", "'raw'")), (("--for", ""), ("raw",)), (("--for", "raw,exx"), ("'exr'",)),
-    (("--ndf", "gxg"), ("gxg", "'ggx'")), (("--ndf", "ggx:alpha=.3"), ("alpha",)), (("--ndf", "ggx:beta=1"), ("beta",)),
-    (("--quality", "norml"), ("norml", "'normal'")), (("--quality", "draft", "--tolerance", "1e-2"), ("not both",)),
-    (("--tolerance", "0"), ("tolerance", "1e-05")), (("--tolerance", "nan"), ("tolerance",)),
-    (("--size", "100"), ("100", "power of two", "2048")), (("--size", "8192"), ("8192",)), (("--size", "0"), ("size",)),
-    (("--size", "8", "--min-size", "16"), ("16", "8")), (("--size", "x"), ("x",)),
-    (("--rotate", "nan"), ("rotate",)), (("--rotate", "inf"), ("rotate",)),
-    (("--exposure", "nan"), ("exposure",)), (("--exposure", "100"), ("64",)),
-    (("--nonfinite", "keep"), ("keep", "refuse", "zero")), (("--sise", "32"), ("--size",)),
-])
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("--for", "rwa"), ("rwa", "'raw'")),
+        (("--for", ""), ("raw",)),
+        (("--for", "raw,exx"), ("'exr'",)),
+        (("--ndf", "gxg"), ("gxg", "'ggx'")),
+        (("--ndf", "ggx:alpha=.3"), ("alpha",)),
+        (("--ndf", "ggx:beta=1"), ("beta",)),
+        (("--quality", "norml"), ("norml", "'normal'")),
+        (("--quality", "draft", "--tolerance", "1e-2"), ("not both",)),
+        (("--tolerance", "0"), ("tolerance", "1e-05")),
+        (("--tolerance", "nan"), ("tolerance",)),
+        (("--size", "100"), ("100", "power of two", "2048")),
+        (("--size", "8192"), ("8192",)),
+        (("--size", "0"), ("size",)),
+        (("--size", "8", "--min-size", "16"), ("16", "8")),
+        (("--size", "x"), ("x",)),
+        (("--rotate", "nan"), ("rotate",)),
+        (("--rotate", "inf"), ("rotate",)),
+        (("--exposure", "nan"), ("exposure",)),
+        (("--exposure", "100"), ("64",)),
+        (("--nonfinite", "keep"), ("keep", "refuse", "zero")),
+        (("--sise", "32"), ("--size",)),
+    ],
+)
 def test_usage_errors_exit_1_and_name_the_range_or_the_nearest(tmp_path, shell, arguments, words):
     source = image(tmp_path / "a.exr", noise(height=2))
     assert shell("bake", source, "-o", tmp_path / "out", *arguments) == 1
@@ -410,17 +439,29 @@ def test_a_model_from_a_file(tmp_path, shell):
     assert shell.rows()[-1]["key"] != key
 
 
-@pytest.mark.parametrize("text, options, code, words", [
-    (MY_GGX, "", 1, "scale must be given"),
-    (MY_GGX, ":scale=3,alpha=.2", 1, "alpha follows"),
-    (MY_GGX, ":scle=3", 1, "scale"),
-    (None, ":scale=3", 2, "my_lobe.clh"),
-    (MY_GGX.replace("my_lobe", "other"), ":scale=3", 3, "ndf_my_lobe_D"),
-    (MY_GGX.replace("scale *", "-scale *"), ":scale=3", 3, "negative"),
-    ("real ndf_my_lobe_D(real cos_m, real a) { return a; }", ":a=1", 5, "roughness"),
-    ("real ndf_my_lobe_D(real cos_m, real alpha) { return cosm; }", "", 4, "cosm"),
-], ids=["parameter missing", "parameter that follows", "unknown parameter", "no file", "other function", "negative",
-        "no alpha", "does not compile"])
+@pytest.mark.parametrize(
+    "text, options, code, words",
+    [
+        (MY_GGX, "", 1, "scale must be given"),
+        (MY_GGX, ":scale=3,alpha=.2", 1, "alpha follows"),
+        (MY_GGX, ":scle=3", 1, "scale"),
+        (None, ":scale=3", 2, "my_lobe.clh"),
+        (MY_GGX.replace("my_lobe", "other"), ":scale=3", 3, "ndf_my_lobe_D"),
+        (MY_GGX.replace("scale *", "-scale *"), ":scale=3", 3, "negative"),
+        ("real ndf_my_lobe_D(real cos_m, real a) { return a; }", ":a=1", 5, "roughness"),
+        ("real ndf_my_lobe_D(real cos_m, real alpha) { return cosm; }", "", 4, "cosm"),
+    ],
+    ids=[
+        "parameter missing",
+        "parameter that follows",
+        "unknown parameter",
+        "no file",
+        "other function",
+        "negative",
+        "no alpha",
+        "does not compile",
+    ],
+)
 def test_models_from_files_that_cannot_be_baked(tmp_path, shell, text, options, code, words):
     source, lobe = image(tmp_path / "a.exr", noise(height=4)), tmp_path / "my_lobe.clh"
     if text is not None:
@@ -495,11 +536,23 @@ def bad(kind: str, path: Path) -> Path:
     return path
 
 
-BAD = {"missing": (2,), "empty": (3, "empty"), "text": (3,), "truncated": (3,), "corrupted": (3,),
-       "corrupted png": (3, "checksum"), "lying": (3, "200000", "100000"), "lying png": (3,),
-       "NaN": (3, "nan", "(7, 5)", "--nonfinite"), "inf": (3, "inf", "(7, 5)"), "negative": (3, "-1.0", "(7, 5)"),
-       "aspect": (3, "40 x 32", "latlong 2:1"), "two channels": (3, "2 channels"), "folder": (3, "px"),
-       "five faces": (3, "nz")}
+BAD = {
+    "missing": (2,),
+    "empty": (3, "empty"),
+    "text": (3,),
+    "truncated": (3,),
+    "corrupted": (3,),
+    "corrupted png": (3, "checksum"),
+    "lying": (3, "200000", "100000"),
+    "lying png": (3,),
+    "NaN": (3, "nan", "(7, 5)", "--nonfinite"),
+    "inf": (3, "inf", "(7, 5)"),
+    "negative": (3, "-1.0", "(7, 5)"),
+    "aspect": (3, "40 x 32", "latlong 2:1"),
+    "two channels": (3, "2 channels"),
+    "folder": (3, "px"),
+    "five faces": (3, "nz"),
+}
 
 
 @pytest.mark.parametrize("kind", BAD)
@@ -633,8 +686,9 @@ def test_files_that_may_not_grow(tmp_path, shell, monkeypatch):
 def test_a_full_stdout(tmp_path):
     source = image(tmp_path / "a.exr", noise())
     with open("/dev/full", "w") as full:
-        done = subprocess.run(command("bake", source, "-o", tmp_path / "out", *SMALL), stdout=full,
-                              stderr=subprocess.PIPE, text=True)
+        done = subprocess.run(
+            command("bake", source, "-o", tmp_path / "out", *SMALL), stdout=full, stderr=subprocess.PIPE, text=True
+        )
     assert done.returncode == 2 and "Traceback" not in done.stderr and "Exception" not in done.stderr, done.stderr
     verified(tmp_path / "out")
 
@@ -642,8 +696,9 @@ def test_a_full_stdout(tmp_path):
 @pytest.mark.parametrize("extra", [(), ("--json",)])
 def test_stdout_closed_early(tmp_path, extra):
     source = image(tmp_path / "a.exr", noise())
-    run = subprocess.Popen(command("bake", source, "-o", tmp_path / "out", *SMALL, *extra), stdout=subprocess.PIPE,
-                           stderr=subprocess.PIPE)
+    run = subprocess.Popen(
+        command("bake", source, "-o", tmp_path / "out", *SMALL, *extra), stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     run.stdout.close()
     complaint = run.stderr.read()
     run.stderr.close()
@@ -661,8 +716,13 @@ def test_ctrl_c_leaves_nothing_half_written(tmp_path, delay):
     source, out = image(tmp_path / "a.exr", noise(height=128)), tmp_path / "out"
     # Seconds of work: the folder appears when it begins.
     arguments = ("bake", source, "-o", out, "--quality", "reference", "--size", "512", "--for", "raw,exr")
-    run = subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    run = subprocess.Popen(
+        command(*arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     begin = time.monotonic()
     while not out.exists():
         assert run.poll() is None and time.monotonic() - begin < 60
@@ -734,12 +794,25 @@ def test_killed_at_random_moments_the_next_run_needs_no_force(tmp_path, times):
 # --- known values ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("pixels", [np.ones((32, 64, 3)), np.ones((1, 1, 3)), np.ones((1, 1)), np.ones((6, 4, 4, 3)),
-                                    np.full((8, 16, 3), 1, np.float32)], ids=lambda p: str(p.shape))
+@pytest.mark.parametrize(
+    "pixels",
+    [
+        np.ones((32, 64, 3)),
+        np.ones((1, 1, 3)),
+        np.ones((1, 1)),
+        np.ones((6, 4, 4, 3)),
+        np.full((8, 16, 3), 1, np.float32),
+    ],
+    ids=lambda p: str(p.shape),
+)
 def test_a_constant_is_constant(tmp_path, pixels):
     pixels = np.asarray(pixels, np.float32)
-    source = image(tmp_path / "a.exr", pixels.reshape(-1, pixels.shape[-2] if pixels.ndim > 2 else 1, 3)
-                   if pixels.ndim > 2 else np.ones((1, 1, 3), np.float32))
+    source = image(
+        tmp_path / "a.exr",
+        pixels.reshape(-1, pixels.shape[-2] if pixels.ndim > 2 else 1, 3)
+        if pixels.ndim > 2
+        else np.ones((1, 1, 3), np.float32),
+    )
     (done,) = bake(source, tmp_path / "out", **SIZES)
     arrays = load(tmp_path / "out")
     for key in ("specular_0", "specular_1", "specular_2", "irradiance"):
@@ -875,8 +948,9 @@ def test_kernels_are_in_the_key(tmp_path, device, monkeypatch):
     assert bake(noise(), tmp_path / "out", device=device, **SIZES)[0].state == "done"
 
 
-@pytest.mark.parametrize("options", [{}, {"samples": 16}, {"for_": "khronos,filament,babylon", "min_size": None}],
-                         ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"samples": 16}, {"for_": "khronos,filament,babylon", "min_size": None}], ids=str
+)
 def test_kernels_are_of_the_files_that_the_key_is_of(tmp_path, device, monkeypatch, options):
     """Every line of a program that a bake builds is of a kernel file, or names models: no text from elsewhere."""
     built, build = set(), Device.build
@@ -884,8 +958,12 @@ def test_kernels_are_of_the_files_that_the_key_is_of(tmp_path, device, monkeypat
     bake(noise(), tmp_path / "out", device=device, **{**SIZES, "size": 16, **options})
     folder = resources.files("whitefurnace.kernels")
     lines = {line for path in Path(str(folder)).rglob("*.cl*") for line in path.read_text("utf-8").splitlines()}
-    unknown = {line for text in built for line in text.splitlines()
-               if line not in lines and not line.startswith(("#line", "#define"))}
+    unknown = {
+        line
+        for text in built
+        for line in text.splitlines()
+        if line not in lines and not line.startswith(("#line", "#define"))
+    }
     assert not unknown
 
 

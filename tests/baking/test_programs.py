@@ -1,4 +1,5 @@
 """What a bake says that it compiles is what it compiles."""
+
 from __future__ import annotations
 
 import hashlib
@@ -53,22 +54,38 @@ def without_terms(text: str) -> str:
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("options", [
-    ("--for", "raw"), ("--for", "khronos"), ("--for", "exr", "--ndf", "phong"), ("--samples", "64"),
-    ("--ndf", "{folder}/hat.clh")], ids=["ggx", "charlie", "phong", "samples", "own"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--for", "raw"),
+        ("--for", "khronos"),
+        ("--for", "exr", "--ndf", "phong"),
+        ("--samples", "64"),
+        ("--ndf", "{folder}/hat.clh"),
+    ],
+    ids=["ggx", "charlie", "phong", "samples", "own"],
+)
 def test_what_is_listed_is_what_is_built(tmp_path, monkeypatch, options):
     (tmp_path / "hat.clh").write_text(HAT)
     write_exr(tmp_path / "sky.exr", np.random.default_rng(3).random((16, 32, 3), np.float32))
     options = tuple(one.format(folder=tmp_path) for one in options)
-    common = (str(tmp_path / "sky.exr"), "-o", str(tmp_path / "out"), "--size", "16",
-              *(() if "--samples" in options else ("--tolerance", "1e-2")),
-              *(() if "khronos" in options else ("--min-size", "8")), *options)
+    common = (
+        str(tmp_path / "sky.exr"),
+        "-o",
+        str(tmp_path / "out"),
+        "--size",
+        "16",
+        *(() if "--samples" in options else ("--tolerance", "1e-2")),
+        *(() if "khronos" in options else ("--min-size", "8")),
+        *options,
+    )
     rows = kernels(*common)
     listed = {without_terms(row["text"]): row for row in rows}
     texts = {without_terms(text) for text in built(monkeypatch, tmp_path, *common)}
     assert not [[line for line in text.splitlines() if line.startswith("#line")] for text in texts - set(listed)]
     assert not {row["program"] for text, row in listed.items() if not row["when"]} - {
-        listed[text]["program"] for text in texts}  # and all that was, but for what depends
+        listed[text]["program"] for text in texts
+    }  # and all that was, but for what depends
     for row in rows:
         data = row["text"].encode()
         assert row["bytes"] == len(data) and row["digest"] == hashlib.sha256(data).hexdigest()
@@ -80,7 +97,8 @@ def test_a_recipe_compiles_no_model_but_its_own(tmp_path):
     arguments = (str(tmp_path / "sky.exr"), "-o", str(tmp_path / "out"))
     rows = kernels(*arguments)
     text = "".join(row["text"] for row in rows)
-    assert "ndf_ggx_D" in text and not [name for name in ("beckmann", "phong", "charlie", "gtr", "abc")
-                                        if f"ndf_{name}_D" in text]
+    assert "ndf_ggx_D" in text and not [
+        name for name in ("beckmann", "phong", "charlie", "gtr", "abc") if f"ndf_{name}_D" in text
+    ]
     told = CliRunner().invoke(cli, ["bake", *arguments, "--dry-run"]).stdout
     assert f"would compile {len(rows)} kernel programs" in told

@@ -1,5 +1,6 @@
 """The page of a batch: its rows say what the manifests say, strangers' names stay text, it sorts in a browser, what has
 not changed is not drawn again, and ten thousand rows take no memory."""
+
 from __future__ import annotations
 
 import json
@@ -111,9 +112,22 @@ def unquoted(address: str) -> str:
 def done(manifest: Path, index: int = 0, **given: object) -> Result:
     told = json.loads(manifest.read_text("utf-8"))
     size = sum(entry["bytes"] for entry in told["files"].values())
-    return Result(**{**dict(index=index, kind="bake", place=f"bake[0]: {told['name']}.exr", name=told["name"],
-                            state="done", output=str(manifest.parent), manifest=str(manifest),
-                            seconds={"read": 0.25, "compute": 1.0, "write": 0.5}, nbytes=size), **given})
+    return Result(
+        **{
+            **dict(
+                index=index,
+                kind="bake",
+                place=f"bake[0]: {told['name']}.exr",
+                name=told["name"],
+                state="done",
+                output=str(manifest.parent),
+                manifest=str(manifest),
+                seconds={"read": 0.25, "compute": 1.0, "write": 0.5},
+                nbytes=size,
+            ),
+            **given,
+        }
+    )
 
 
 # Names of files, and so of environments: markup, both quotes, an entity, what runs right to left, and an override.
@@ -126,17 +140,24 @@ def baked(tmp_path_factory, device) -> Path:
     folder = tmp_path_factory.mktemp("gallery")
     for k, name in enumerate(NAMES):
         pixels = np.random.default_rng(k).random((16, 32, 3), dtype=np.float32) + np.float32(0.1)
-        pixels[4, 7] = 10.0 ** k
+        pixels[4, 7] = 10.0**k
         write_exr(folder / f"{name}.exr", pixels)
-    bake([folder / f"{name}.exr" for name in NAMES], folder / "out", for_="raw,babylon", size=16, tolerance=1e-2,
-         device=device)
+    bake(
+        [folder / f"{name}.exr" for name in NAMES],
+        folder / "out",
+        for_="raw,babylon",
+        size=16,
+        tolerance=1e-2,
+        device=device,
+    )
     return folder / "out"
 
 
 def test_rows_say_what_manifests_say(baked, tmp_path):
     manifests = [baked / f"{name}.json" for name in NAMES]
-    failed = Result(9, "bake", "bake[1]: no\n<i>.exr", "no", "failed", "out", message="no <i>.exr & \x1b[2Jno \udcff",
-                    exit_code=3)
+    failed = Result(
+        9, "bake", "bake[1]: no\n<i>.exr", "no", "failed", "out", message="no <i>.exr & \x1b[2Jno \udcff", exit_code=3
+    )
     results = [*(done(m, k) for k, m in enumerate(manifests)), failed]
     path = write_gallery(tmp_path / "a", results, title="</title><script>alert(1)</script>.toml")
     page = opened(path)
@@ -150,15 +171,17 @@ def test_rows_say_what_manifests_say(baked, tmp_path):
     assert page.values("As stored") == pytest.approx([max(a, b) for a, b in zip(stored, errors, strict=True)], rel=0.5)
     assert all(v >= s * (1 - 1e-5) for v, s in zip(page.values("As stored"), stored, strict=True))
     assert page.values("Sun share") == pytest.approx(
-        [m["source"]["statistics"]["brightest_share"] for m in told], rel=1e-5)
+        [m["source"]["statistics"]["brightest_share"] for m in told], rel=1e-5
+    )
     kept = [max(abs(x["energy_kept"] - 1) for x in m["levels"]) for m in told]
     assert page.values("Energy kept") == pytest.approx(kept, rel=1e-5)
     assert page.values("Time") == [1.75] * 4
     assert page.values("Size") == [result.nbytes for result in results[:4]]
     # Of the brightest sun RGBD keeps 255 of the mean at most, which the bake said and the manifest tells.
     assert page.values("Notices")[3] > 0 and "rgbd" in page.rows["bake"][3][-1][0]
-    assert page.rows["failed"] == [[("bake[1]: no\\n<i>.exr", None), ("no <i>.exr & \\x1b[2Jno \\udcff", None),
-                                    ("3", "3")]]
+    assert page.rows["failed"] == [
+        [("bake[1]: no\\n<i>.exr", None), ("no <i>.exr & \\x1b[2Jno \\udcff", None), ("3", "3")]
+    ]
     assert page.text.index('id="of-failed"') < page.text.index('id="of-bake"'), "failures stand on top"
     head = page.text[: page.text.index("<main>")]
     assert "<dt>items</dt><dd>5<" in head and "<dt>failed</dt><dd>1<" in head and told[0]["device"]["name"] in head
@@ -167,8 +190,7 @@ def test_rows_say_what_manifests_say(baked, tmp_path):
 
 def test_the_same_results_give_the_same_bytes_in_any_order(baked, tmp_path):
     results = [done(baked / f"{name}.json", k) for k, name in enumerate(NAMES)]
-    paths = [write_gallery(tmp_path / where, given)
-             for where, given in (("a", results), ("b", reversed(results)))]
+    paths = [write_gallery(tmp_path / where, given) for where, given in (("a", results), ("b", reversed(results)))]
     assert paths[0].read_bytes() == paths[1].read_bytes()
     pictures = [{p.name: p.read_bytes() for p in (tmp_path / where / "strips").iterdir()} for where in "ab"]
     assert pictures[0] == pictures[1] and len(pictures[0]) == 4
@@ -219,11 +241,26 @@ def test_a_bake_without_its_files_keeps_its_row(baked, tmp_path, device):
     assert "no picture" in page.rows["bake"][0][0][0] and "is not there" in page.rows["bake"][0][0][0]
 
 
-@pytest.mark.parametrize("wrong", [
-    {"key": "../../x"}, {"recipe": []}, {"recipe": {"for": [3]}}, {"levels": [1, {"error": "x", "size": []}]},
-    {"levels": [{"error": 1e999, "for": 3}]}, {"files": {"a": 7, "raw/x": {"levels": {"a": 1}, "bytes": -1e308}}},
-    {"source": 3}, {"source": {"notices": 5, "statistics": []}}, {"sh": {"coefficients": [[1]]}}, {"device": "<b>"},
-    {"irradiance": 5}, {"whitefurnace": ["<b>"]}, {"notices": {"<b>": 1}}, {"files": []}, {"name": 5}])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"key": "../../x"},
+        {"recipe": []},
+        {"recipe": {"for": [3]}},
+        {"levels": [1, {"error": "x", "size": []}]},
+        {"levels": [{"error": 1e999, "for": 3}]},
+        {"files": {"a": 7, "raw/x": {"levels": {"a": 1}, "bytes": -1e308}}},
+        {"source": 3},
+        {"source": {"notices": 5, "statistics": []}},
+        {"sh": {"coefficients": [[1]]}},
+        {"device": "<b>"},
+        {"irradiance": 5},
+        {"whitefurnace": ["<b>"]},
+        {"notices": {"<b>": 1}},
+        {"files": []},
+        {"name": 5},
+    ],
+)
 def test_a_manifest_with_nonsense_in_it_breaks_no_page(baked, tmp_path, wrong):
     told = json.loads((baked / f"{NAMES[1]}.json").read_text("utf-8"))
     path = tmp_path / f"{NAMES[1]}.json"
@@ -313,18 +350,44 @@ def test_every_engine_shows_the_same_sky(baked, tmp_path, device):
 def many(folder: Path, count: int) -> list[Result]:
     """Results that share one manifest."""
     manifest = folder / "env.json"
-    rows = [{"size": 128 >> k, "error": 1e-4 / (k + 1), "worst": 2e-4, "energy_kept": 1.0, "for": ["raw"]}
-            for k in range(4)]
-    manifest.write_text(json.dumps({
-        "whitefurnace": "0.1.0", "name": "env", "key": KEY, "levels": rows, "irradiance": rows[0],
-        "recipe": {"for": ["raw"]}, "device": {"name": "a", "platform": "b", "driver": "c"}, "files": {},
-        "source": {"layout": "latlong", "statistics": {"width": 8, "height": 4, "brightest_share": 0.25}}}))
-    thumbnails.write_thumbnail(folder / "x.png", ([np.ones((6, 4, 4, 3), np.float32)],
-                                                  np.ones((thumbnails.normals().shape[1], 3)), thumbnails.WORLD))
+    rows = [
+        {"size": 128 >> k, "error": 1e-4 / (k + 1), "worst": 2e-4, "energy_kept": 1.0, "for": ["raw"]} for k in range(4)
+    ]
+    manifest.write_text(
+        json.dumps(
+            {
+                "whitefurnace": "0.1.0",
+                "name": "env",
+                "key": KEY,
+                "levels": rows,
+                "irradiance": rows[0],
+                "recipe": {"for": ["raw"]},
+                "device": {"name": "a", "platform": "b", "driver": "c"},
+                "files": {},
+                "source": {"layout": "latlong", "statistics": {"width": 8, "height": 4, "brightest_share": 0.25}},
+            }
+        )
+    )
+    thumbnails.write_thumbnail(
+        folder / "x.png",
+        ([np.ones((6, 4, 4, 3), np.float32)], np.ones((thumbnails.normals().shape[1], 3)), thumbnails.WORLD),
+    )
     (folder / "strips").mkdir()
     (folder / "x.png").rename(folder / "strips" / f"{KEY[:32]}-{thumbnails.LOOK}.png")
-    return [Result(k, "bake", f"bake[0]: probes/env {k:02d}.exr", f"env {k}", "done" if k % 3 else "skipped", "out",
-                   str(manifest), {"compute": float(k * 7919 % 101)}, 1000 + k * 104729 % 5003) for k in range(count)]
+    return [
+        Result(
+            k,
+            "bake",
+            f"bake[0]: probes/env {k:02d}.exr",
+            f"env {k}",
+            "done" if k % 3 else "skipped",
+            "out",
+            str(manifest),
+            {"compute": float(k * 7919 % 101)},
+            1000 + k * 104729 % 5003,
+        )
+        for k in range(count)
+    ]
 
 
 @pytest.fixture
@@ -356,20 +419,31 @@ def test_it_sorts_and_finds_in_a_browser(chromium, tmp_path, monkeypatch, most):
             keys = [key(next(r for r in results if r.name == name)) for name in shown["names"]]
             values = [k for k in keys if k is not None]
             assert values == sorted(values, key=lambda k, sign=sign: sign * k), column
-            assert keys[len(values):] == [None] * (30 - len(values)), "what has no value is last"
+            assert keys[len(values) :] == [None] * (30 - len(values)), "what has no value is last"
     assert about["found"]["names"] == ["env 7"] and about["found"]["said"] == "1 of 30 environments"
 
 
 def test_strangers_names_run_nothing_in_a_browser(chromium, baked, tmp_path):
     """From disk, where its policy must let it see its own pictures, and from a server."""
-    path = write_gallery(tmp_path / "r", [done(baked / f"{name}.json", k) for k, name in enumerate(NAMES)],
-                         title=NAMES[0])
+    path = write_gallery(
+        tmp_path / "r", [done(baked / f"{name}.json", k) for k, name in enumerate(NAMES)], title=NAMES[0]
+    )
     about = browser.rendered("gallery", [], tmp_path / "r", tmp_path / "r").about
     assert about["first"]["names"] == list(NAMES) and not about["alerted"]
     assert all(width > height > 0 for width, height in about["images"])
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        said = subprocess.run([chromium, *browser.FLAGS, f"--user-data-dir={profile}", "--enable-logging=stderr",
-                               "--dump-dom", path.as_uri()], capture_output=True, timeout=60)
+        said = subprocess.run(
+            [
+                chromium,
+                *browser.FLAGS,
+                f"--user-data-dir={profile}",
+                "--enable-logging=stderr",
+                "--dump-dom",
+                path.as_uri(),
+            ],
+            capture_output=True,
+            timeout=60,
+        )
     console = [line for line in said.stderr.decode(errors="replace").splitlines() if "CONSOLE" in line]
     assert not console, console
     assert b'id="of-bake"' in said.stdout
@@ -398,8 +472,10 @@ def test_batch_writes_it(tmp_path, capsys, device):
     write_exr(tmp_path / "a.exr", np.ones((4, 8, 3), np.float32))
     (tmp_path / "b.exr").write_bytes(b"no image")
     job = tmp_path / "job.toml"
-    job.write_text('[[bake]]\nenvironments = ["*.exr"]\noutput = "out"\nsize = 16\nmin_size = 16\ntolerance = 1e-2\n'
-                   '[[lut]]\nkind = "dfg"\noutput = "dfg.npy"\nsize = 8\ntolerance = 1e-3\n')
+    job.write_text(
+        '[[bake]]\nenvironments = ["*.exr"]\noutput = "out"\nsize = 16\nmin_size = 16\ntolerance = 1e-2\n'
+        '[[lut]]\nkind = "dfg"\noutput = "dfg.npy"\nsize = 8\ntolerance = 1e-3\n'
+    )
     report = tmp_path / "report"
     assert shell("batch", job, "--report", report, "--dry-run") == 8 and not report.exists()
     assert shell("batch", job, "--report", report, "--json", "--device", device.name) == 8

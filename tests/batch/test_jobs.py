@@ -1,5 +1,6 @@
 """`batch` from end to end: what a job is refused for, what runs again, what is left by runs that were killed, and that
 nothing of a stranger's job leaves its folder."""
+
 from __future__ import annotations
 
 import contextlib
@@ -83,47 +84,55 @@ B = '[[bake]]\nenvironments = ["probes/p00.exr"]\noutput = "out"\n'
 L = '[[lut]]\nkind = "dfg"\noutput = "dfg.npy"\nsize = 8\n'
 
 
-@pytest.mark.parametrize("text, words", [
-    ("", ["no [[bake]]"]),
-    ("[[bak]]\n", ["bak is not known", "'bake'"]),
-    ("[bake]\nsize = 1\n", ["[[bake]]"]),
-    ("bake = 1\n", ["[[bake]]"]),
-    ("[[bake]\n", ["not TOML"]),
-    (B + "sise = 16\n", ["bake[0].sise is not known", "'size'"]),
-    (B + "min-size = 16\nmin_size = 8\n", ["given twice"]),
-    (B + 'size = "16"\n', ["bake[0].size", "expected `int"]),
-    (B + "size = 17\n", ["bake[0]", "power of two", "[1, 2048]"]),
-    (B + "size = 9223372036854775807\n", ["bake[0]", "power of two", "[1, 2048]"]),
-    (B + "levels = 1000000\n", ["bake[0]", "[1, 32]"]),
-    (B + "certify = 1000000000\n", ["bake[0]", "certify"]),
-    (B + "tolerance = nan\n", ["bake[0]", "tolerance"]),
-    (B + "rotate = inf\n", ["bake[0]", "rotate"]),
-    (B + "exposure = 1000\n", ["bake[0]", "exposure"]),
-    (B + 'nonfinite = "ignore"\n', ["bake[0]", "nonfinite"]),
-    (B + 'sun = "kept"\n', ["bake[0]", "'keep'"]),
-    (B + 'for = ["filamant"]\n', ["bake[0]", "'filament'"]),
-    (B + 'for = "raw"\n', ["bake[0].for", "expected `array"]),
-    (B + "for = []\n", ["bake[0].for is empty"]),
-    (B + 'for = ["raw,exr"]\n', ["a comma"]),
-    (B + 'ndf = "ggz"\n', ["bake[0]", "'ggx'"]),
-    (B.replace("p00", "nope"), ["bake[0].environments[0]", "is not there"]),
-    (B.replace("p00", "n*"), ["bake[0].environments[0]", "nothing matches"]),
-    ('[[bake]]\nenvironments = []\noutput = "out"\n', ["environments is empty"]),
-    ('[[bake]]\nenvironments = ["probes/p00.exr"]\n', ["bake[0]", "`output`"]),
-    (B + B.replace("[[bake]]", "[[bake]]\nsize = 8\nmin_size = 8"), [
-        "bake[0]: probes/p00.exr", "bake[1]: probes/p00.exr", "both write", "p00.npz"]),
-    (B.replace('p00.exr"', 'p00.exr", "other/p00.exr"'), ["probes/p00.exr", "other/p00.exr", "both write"]),
-    (L + L, ["lut[0]: dfg.npy", "lut[1]: dfg.npy", "both write"]),
-    (L + "size = 8\n", ["not TOML"]),
-    (L.replace("8", "99999"), ["lut[0]", "[1, 16384]"]),
-    (L.replace("8", "16384") + 'axis = ["f0=0:1:16384", "ior=1:2:16384"]\n', ["lut[0]"]),
-    (L.replace('"dfg"', '"dgf"'), ["lut[0]", "'dfg'"]),
-    (L + 'axis = ["NoV"]\n', ["lut[0]", "NAME=A:B:N"]),
-    (B.replace('"out"', '"."') + '[[lut]]\nkind = "dfg"\noutput = "raw/p00.npy"\n[[bake]]\n'
-     'environments = ["raw/p00.npz"]\noutput = "x"\n', ["is read, and written by bake[0]"]),
-    # Every mistake of a job is told at once.
-    (B + "size = 17\n" + L.replace("8", "0"), ["bake[0]", "lut[0]"]),
-])
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("", ["no [[bake]]"]),
+        ("[[bak]]\n", ["bak is not known", "'bake'"]),
+        ("[bake]\nsize = 1\n", ["[[bake]]"]),
+        ("bake = 1\n", ["[[bake]]"]),
+        ("[[bake]\n", ["not TOML"]),
+        (B + "sise = 16\n", ["bake[0].sise is not known", "'size'"]),
+        (B + "min-size = 16\nmin_size = 8\n", ["given twice"]),
+        (B + 'size = "16"\n', ["bake[0].size", "expected `int"]),
+        (B + "size = 17\n", ["bake[0]", "power of two", "[1, 2048]"]),
+        (B + "size = 9223372036854775807\n", ["bake[0]", "power of two", "[1, 2048]"]),
+        (B + "levels = 1000000\n", ["bake[0]", "[1, 32]"]),
+        (B + "certify = 1000000000\n", ["bake[0]", "certify"]),
+        (B + "tolerance = nan\n", ["bake[0]", "tolerance"]),
+        (B + "rotate = inf\n", ["bake[0]", "rotate"]),
+        (B + "exposure = 1000\n", ["bake[0]", "exposure"]),
+        (B + 'nonfinite = "ignore"\n', ["bake[0]", "nonfinite"]),
+        (B + 'sun = "kept"\n', ["bake[0]", "'keep'"]),
+        (B + 'for = ["filamant"]\n', ["bake[0]", "'filament'"]),
+        (B + 'for = "raw"\n', ["bake[0].for", "expected `array"]),
+        (B + "for = []\n", ["bake[0].for is empty"]),
+        (B + 'for = ["raw,exr"]\n', ["a comma"]),
+        (B + 'ndf = "ggz"\n', ["bake[0]", "'ggx'"]),
+        (B.replace("p00", "nope"), ["bake[0].environments[0]", "is not there"]),
+        (B.replace("p00", "n*"), ["bake[0].environments[0]", "nothing matches"]),
+        ('[[bake]]\nenvironments = []\noutput = "out"\n', ["environments is empty"]),
+        ('[[bake]]\nenvironments = ["probes/p00.exr"]\n', ["bake[0]", "`output`"]),
+        (
+            B + B.replace("[[bake]]", "[[bake]]\nsize = 8\nmin_size = 8"),
+            ["bake[0]: probes/p00.exr", "bake[1]: probes/p00.exr", "both write", "p00.npz"],
+        ),
+        (B.replace('p00.exr"', 'p00.exr", "other/p00.exr"'), ["probes/p00.exr", "other/p00.exr", "both write"]),
+        (L + L, ["lut[0]: dfg.npy", "lut[1]: dfg.npy", "both write"]),
+        (L + "size = 8\n", ["not TOML"]),
+        (L.replace("8", "99999"), ["lut[0]", "[1, 16384]"]),
+        (L.replace("8", "16384") + 'axis = ["f0=0:1:16384", "ior=1:2:16384"]\n', ["lut[0]"]),
+        (L.replace('"dfg"', '"dgf"'), ["lut[0]", "'dfg'"]),
+        (L + 'axis = ["NoV"]\n', ["lut[0]", "NAME=A:B:N"]),
+        (
+            B.replace('"out"', '"."') + '[[lut]]\nkind = "dfg"\noutput = "raw/p00.npy"\n[[bake]]\n'
+            'environments = ["raw/p00.npz"]\noutput = "x"\n',
+            ["is read, and written by bake[0]"],
+        ),
+        # Every mistake of a job is told at once.
+        (B + "size = 17\n" + L.replace("8", "0"), ["bake[0]", "lut[0]"]),
+    ],
+)
 def test_a_job_is_checked_whole_before_anything_runs(tmp_path, shell, text, words):
     probes(tmp_path, 1)
     image(tmp_path / "other" / "p00.exr")
@@ -155,8 +164,11 @@ def test_outputs_stay_under_the_folder_of_the_job(tmp_path, shell, kind, output)
     (tmp_path / "victim").mkdir()
     (inside / "link").symlink_to(tmp_path / "victim")
     output = f"{output}/x.npy" if kind == "lut" and output else output
-    text = f'[[bake]]\nenvironments = ["probes/*"]\noutput = "{output}"\n{SIZES}' if kind == "bake" else \
-        f'[[lut]]\nkind = "dfg"\noutput = "{output}"\nsize = 4\n'
+    text = (
+        f'[[bake]]\nenvironments = ["probes/*"]\noutput = "{output}"\n{SIZES}'
+        if kind == "bake"
+        else f'[[lut]]\nkind = "dfg"\noutput = "{output}"\nsize = 4\n'
+    )
     path = job(inside, text)
     before = tree(tmp_path)
     assert shell("batch", path) == 3 and "output" in shell.sentence()
@@ -213,9 +225,17 @@ def test_manifests_do_not_lead_out_of_their_folder(tmp_path):
     entry = {"sha256": hashlib.sha256(b"mine").hexdigest()}
     for name in (".p00.json.tmp", "p00.json"):
         (tmp_path / "out").mkdir(exist_ok=True)
-        (tmp_path / "out" / name).write_text(json.dumps({
-            "whitefurnace": "0", "name": "p00", "key": "", "recipe": {"for": ["raw"]},
-            "files": {"raw/../../thesis": entry}}))
+        (tmp_path / "out" / name).write_text(
+            json.dumps(
+                {
+                    "whitefurnace": "0",
+                    "name": "p00",
+                    "key": "",
+                    "recipe": {"for": ["raw"]},
+                    "files": {"raw/../../thesis": entry},
+                }
+            )
+        )
         (result,) = map(batch.do, batch.job(job(tmp_path), force=True).items)
         assert result.state == "done" and thesis.read_text() == "mine"
         shutil.rmtree(tmp_path / "out")
@@ -224,13 +244,21 @@ def test_manifests_do_not_lead_out_of_their_folder(tmp_path):
 def test_no_code_of_a_job_runs_unless_that_is_allowed(tmp_path, shell):
     probes(tmp_path, 1)
     (tmp_path / "mine.clh").write_text("real ndf_mine_D(real cos_m, real alpha) { return cos_m + alpha; }\n")
-    for text in (f'[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\n{SIZES}ndf = "mine.clh"\n',
-                 '[[lut]]\nkind = "albedo"\noutput = "a.npy"\nsize = 4\nndf = "mine.clh:alpha=.3"\ntolerance = 1e-3\n',
-                 '[[lut]]\nkind = "albedo"\noutput = "b.npy"\nsize = 4\nbrdf = "mine.clh"\n'):
+    for text in (
+        f'[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\n{SIZES}ndf = "mine.clh"\n',
+        '[[lut]]\nkind = "albedo"\noutput = "a.npy"\nsize = 4\nndf = "mine.clh:alpha=.3"\ntolerance = 1e-3\n',
+        '[[lut]]\nkind = "albedo"\noutput = "b.npy"\nsize = 4\nbrdf = "mine.clh"\n',
+    ):
         path = job(tmp_path, text)
         assert shell("batch", path) == 3 and "--allow-kernels" in shell.sentence()
-    assert shell("batch", job(tmp_path, f'[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\n{SIZES}'
-                                        'ndf = "mine.clh"\n'), "--allow-kernels") == 0
+    assert (
+        shell(
+            "batch",
+            job(tmp_path, f'[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\n{SIZES}ndf = "mine.clh"\n'),
+            "--allow-kernels",
+        )
+        == 0
+    )
     whole(tmp_path / "out", {"p00"})
     # A worker that lives on takes the file as it is now.
     (tmp_path / "mine.clh").write_text("real ndf_mine_D(real cos_m, real alpha) { return 2.0f * cos_m + alpha; }\n")
@@ -260,13 +288,34 @@ def test_many_patterns_and_deep_folders_take_no_minutes(tmp_path, shell, monkeyp
 def test_patterns_find_what_glob_finds(tmp_path):
     import glob
 
-    for name in ("a.exr", "b.exr", "ab.exr", ".hidden.exr", "d/a.exr", "d/e/c.exr", "d/e/.x/f.exr", "[x].exr",
-                 "f/px.png"):
+    for name in (
+        "a.exr",
+        "b.exr",
+        "ab.exr",
+        ".hidden.exr",
+        "d/a.exr",
+        "d/e/c.exr",
+        "d/e/.x/f.exr",
+        "[x].exr",
+        "f/px.png",
+    ):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).touch()
     (tmp_path / "loop").symlink_to(tmp_path)
-    for pattern in ("*.exr", "?.exr", "[ab].exr", "d/*", "**/*.exr", "d/**/*.exr", "*/*.exr", "**/e/*", ".*.exr",
-                    "d/e/c*", "[[]x].exr", "**"):
+    for pattern in (
+        "*.exr",
+        "?.exr",
+        "[ab].exr",
+        "d/*",
+        "**/*.exr",
+        "d/**/*.exr",
+        "*/*.exr",
+        "**/e/*",
+        ".*.exr",
+        "d/e/c*",
+        "[[]x].exr",
+        "**",
+    ):
         found = [os.path.relpath(p, tmp_path) for p in batch._Finder().find(tmp_path, pattern)]
         # Links are not followed by ** here: through `loop` glob finds all of it again and again.
         want = {p.rstrip("/") for p in glob.glob(pattern, root_dir=tmp_path, recursive=True)} - {""}
@@ -288,9 +337,11 @@ def test_what_a_job_wrote_is_not_what_its_patterns_find(tmp_path):
 
 def test_a_second_run_does_nothing_and_one_option_bakes_what_depends_on_it(tmp_path, shell, monkeypatch):
     probes(tmp_path, 2)
-    text = (f'[[bake]]\nenvironments = ["probes/p00.exr", "demo"]\noutput = "out"\n{SIZES}'
-            f'[[bake]]\nenvironments = ["probes/p01.exr"]\noutput = "out/deep"\nfor = ["raw", "bevy"]\n{SIZES}'
-            '[[lut]]\nkind = "dfg"\noutput = "luts/dfg.npy"\nsize = 8\n')
+    text = (
+        f'[[bake]]\nenvironments = ["probes/p00.exr", "demo"]\noutput = "out"\n{SIZES}'
+        f'[[bake]]\nenvironments = ["probes/p01.exr"]\noutput = "out/deep"\nfor = ["raw", "bevy"]\n{SIZES}'
+        '[[lut]]\nkind = "dfg"\noutput = "luts/dfg.npy"\nsize = 8\n'
+    )
     path = job(tmp_path, text)
     assert shell("batch", path) == 0 and "4 done" in shell.out
     before = {name: (tmp_path / name).stat().st_mtime_ns for name in tree(tmp_path)}
@@ -303,8 +354,9 @@ def test_a_second_run_does_nothing_and_one_option_bakes_what_depends_on_it(tmp_p
     # A second engine for one of the tables: the others stay as they are.
     job(tmp_path, text.replace('"bevy"]', '"bevy", "exr"]'))
     assert shell("batch", path, "--json") == 0
-    assert [row["event"] for row in shell.rows()] == ["skipped", "skipped", "done", "skipped", "summary"] or \
-        sorted(row["event"] for row in shell.rows()) == ["done", "skipped", "skipped", "skipped", "summary"]
+    assert [row["event"] for row in shell.rows()] == ["skipped", "skipped", "done", "skipped", "summary"] or sorted(
+        row["event"] for row in shell.rows()
+    ) == ["done", "skipped", "skipped", "skipped", "summary"]
     # And what bake makes of the same options is the same file.
     bake(tmp_path / "probes" / "p00.exr", tmp_path / "alone", **OPTIONS)
     assert (tmp_path / "alone/raw/p00.npz").read_bytes() == (tmp_path / "out/raw/p00.npz").read_bytes()
@@ -360,7 +412,7 @@ def test_shards_are_disjoint_cover_and_stay_when_items_are_added(tmp_path, shell
         assert max(map(len, shards)) - min(map(len, shards)) <= 1
     before = [item.name for item in batch.job(tmp_path / "job.toml").shard(2, 3).items]
     image(tmp_path / "probes" / "z.exr")
-    assert [item.name for item in batch.job(tmp_path / "job.toml").shard(2, 3).items][:len(before)] == before
+    assert [item.name for item in batch.job(tmp_path / "job.toml").shard(2, 3).items][: len(before)] == before
     for wrong in ("0/3", "4/3", "1", "a/b", "1/0", "-1/3", "1/99999999"):
         assert shell("batch", tmp_path / "job.toml", "--shard", wrong) == 1 and "I/N" in shell.sentence()
     assert shell("batch", tmp_path / "job.toml", "--shard", "8/8", "--json") == 0
@@ -379,8 +431,9 @@ def test_make_reads_the_depfile(tmp_path, shell):
 
     def asked(name: str) -> int:
         target = str(tmp_path / "my out" / f"{name}.json")
-        return subprocess.run(["make", "-q", "-C", str(tmp_path), "assigned" if "=" in name else target],
-                              capture_output=True).returncode
+        return subprocess.run(
+            ["make", "-q", "-C", str(tmp_path), "assigned" if "=" in name else target], capture_output=True
+        ).returncode
 
     for name in names:
         assert asked(name) != 2, name  # there is a rule
@@ -441,8 +494,11 @@ def test_a_lock_whose_file_was_removed_is_no_lock(tmp_path, monkeypatch):
 
 def test_two_batches_into_one_folder(tmp_path):
     probes(tmp_path, 12, height=16)
-    path = job(tmp_path, '[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\nsize = 32\nmin_size = 16\n'
-                         '[[lut]]\nkind = "albedo"\noutput = "a.npy"\nsize = 64\n')
+    path = job(
+        tmp_path,
+        '[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\nsize = 32\nmin_size = 16\n'
+        '[[lut]]\nkind = "albedo"\noutput = "a.npy"\nsize = 64\n',
+    )
     pipes = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     runs = [subprocess.Popen(command("batch", path, "--json"), **pipes) for _ in range(2)]
     events = {}
@@ -469,17 +525,24 @@ def died(folder: Path, output: str, count: int, rng: random.Random, times: int) 
     for k in range(times):
         # Now and then another recipe, over what was there.
         text = path.read_text()
-        path.write_text("\n".join([*(line for line in text.splitlines() if not line.startswith("exposure")),
-                                   f"exposure = {k + 1}", ""]))
+        path.write_text(
+            "\n".join(
+                [*(line for line in text.splitlines() if not line.startswith("exposure")), f"exposure = {k + 1}", ""]
+            )
+        )
         run = subprocess.Popen(command("batch", path, "--quiet"), start_new_session=True)
         moments.append(rng.uniform(0.2, 1.0))
         time.sleep(length * moments[-1])
         os.killpg(run.pid, signal.SIGKILL)
         run.wait()
         survivors(out)
-        kept = {name: (out / name).stat().st_mtime_ns for name in tree(out)
-                if name.endswith(".json") and not name.startswith(".")
-                and json.loads((out / name).read_text())["recipe"]["exposure"] == k + 1}
+        kept = {
+            name: (out / name).stat().st_mtime_ns
+            for name in tree(out)
+            if name.endswith(".json")
+            and not name.startswith(".")
+            and json.loads((out / name).read_text())["recipe"]["exposure"] == k + 1
+        }
         if k % 3 == 0:  # died again
             run = subprocess.Popen(command("batch", path, "--quiet"), start_new_session=True)
             time.sleep(length * rng.uniform(0.2, 0.8))
@@ -522,6 +585,7 @@ def deadly(step: int | None):
                 raise Death
             calls.append(name)
             return real[name](*args, **kwargs)
+
         return call
 
     def opened(path, *args, **kwargs):
@@ -693,7 +757,8 @@ def test_the_digest_without_decoding_is_that_of_the_environment(tmp_path, form):
     if form == "faces":
         for k, name in enumerate(("px", "nx", "py", "ny", "pz", "nz")):
             write_exr(tmp_path / "six" / f"{name}.exr", np.full((4, 4, 3), k + 1, np.float32)) if (
-                tmp_path / "six").mkdir(exist_ok=True) is None else None
+                tmp_path / "six"
+            ).mkdir(exist_ok=True) is None else None
         path = tmp_path / "six"
     elif form in ("ktx2", "gltf"):
         engine = {"ktx2": "khronos", "gltf": "gltf"}[form]
@@ -792,9 +857,11 @@ def test_a_result_is_small_and_items_can_be_sent(tmp_path):
 
 
 def test_help_of_batch_imports_nothing_heavy():
-    script = ("import sys\nfrom whitefurnace.cli import main\n"
-              "try: main(['batch', '--help'])\nexcept SystemExit: pass\n"
-              "sys.exit(bool({'numpy', 'msgspec', 'distributed'} & set(sys.modules)))")
+    script = (
+        "import sys\nfrom whitefurnace.cli import main\n"
+        "try: main(['batch', '--help'])\nexcept SystemExit: pass\n"
+        "sys.exit(bool({'numpy', 'msgspec', 'distributed'} & set(sys.modules)))"
+    )
     assert subprocess.run([sys.executable, "-c", script], capture_output=True).returncode == 0
 
 

@@ -1,4 +1,5 @@
 """The pool: every item has one result, whatever becomes of it, of its worker, of the scheduler or of us."""
+
 from __future__ import annotations
 
 import contextlib
@@ -152,9 +153,17 @@ def cluster():
     import dask
 
     # The scheduler fetches results from a worker; a killed one it tries for 30 s by default.
-    with dask.config.set({"distributed.comm.timeouts.connect": "5s"}), \
-            distributed.LocalCluster(n_workers=2, threads_per_worker=4, processes=True, host="127.0.0.1",
-                                     dashboard_address=":0", resources={"OPENCL": 1}) as local:
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "5s"}),
+        distributed.LocalCluster(
+            n_workers=2,
+            threads_per_worker=4,
+            processes=True,
+            host="127.0.0.1",
+            dashboard_address=":0",
+            resources={"OPENCL": 1},
+        ) as local,
+    ):
         yield local.scheduler_address
 
 
@@ -170,10 +179,14 @@ def where(request) -> dict[str, object]:
 
 
 def test_a_failing_item_fails_alone_and_every_item_has_one_result(where):
-    acts = {"raise prepare": ("RuntimeError: prepare broke", 2), "raise compute": ("RuntimeError: compute broke", 2),
-            "raise write": ("RuntimeError: write broke", 2), "ours compute": ("a tolerance was missed in compute", 7),
-            "unpicklable prepare": ("Unpicklable: it holds a lock", 2),
-            "unpicklable compute": ("Unpicklable: it holds a lock", 2)}
+    acts = {
+        "raise prepare": ("RuntimeError: prepare broke", 2),
+        "raise compute": ("RuntimeError: compute broke", 2),
+        "raise write": ("RuntimeError: write broke", 2),
+        "ours compute": ("a tolerance was missed in compute", 7),
+        "unpicklable prepare": ("Unpicklable: it holds a lock", 2),
+        "unpicklable compute": ("Unpicklable: it holds a lock", 2),
+    }
     jobs = [Job(f"good {k}") for k in range(5)] + [Job(act, act) for act in acts]
     jobs += [Job("there", "skip")] + [Job(f"more {k}") for k in range(5)]
     found = collect(jobs, **where)
@@ -265,7 +278,7 @@ def test_items_are_taken_as_there_is_room_and_stop_finishes_what_is_in_flight(wh
             stop.set()
 
     pool.run(STAGES, endless(), on_result=on_result, stop=stop, **where)
-    assert sorted(map(int, found)) == taken[:len(found)] and len(taken) - len(found) <= 1
+    assert sorted(map(int, found)) == taken[: len(found)] and len(taken) - len(found) <= 1
 
 
 def test_impossible_arguments_are_told():
@@ -279,14 +292,19 @@ def test_bakes_are_the_same_bytes_everywhere(where, tmp_path):
         write_exr(tmp_path / f"e{k}.exr", np.random.default_rng(k).random((8, 16, 3), dtype=np.float32))
     made = {}
     for folder, options in (("apart", where), ("here", {})):
-        (tmp_path / f"{folder}.toml").write_text('[[bake]]\nenvironments = ["*.exr"]\nsize = 8\nmin_size = 4\n'
-                                                 f'tolerance = 1e-2\noutput = "{folder}"\n')
+        (tmp_path / f"{folder}.toml").write_text(
+            f'[[bake]]\nenvironments = ["*.exr"]\nsize = 8\nmin_size = 4\ntolerance = 1e-2\noutput = "{folder}"\n'
+        )
         states = []
-        batch.run(batch.job(tmp_path / f"{folder}.toml"), on_result=lambda result, s=states: s.append(result.state),
-                  **options)
+        batch.run(
+            batch.job(tmp_path / f"{folder}.toml"), on_result=lambda result, s=states: s.append(result.state), **options
+        )
         assert states == ["done"] * 4
-        made[folder] = {path.relative_to(tmp_path / folder): path.read_bytes()
-                        for path in (tmp_path / folder).rglob("*") if path.is_file()}
+        made[folder] = {
+            path.relative_to(tmp_path / folder): path.read_bytes()
+            for path in (tmp_path / folder).rglob("*")
+            if path.is_file()
+        }
     assert len(made["here"]) == 8 and made["apart"] == made["here"]
 
 
@@ -305,11 +323,17 @@ def test_reading_computing_and_writing_go_on_at_the_same_time():
         def call(x):
             meet(x if isinstance(x, str) else x[0], stage)
             return then(x)
+
         return call
 
-    stages = pool.Stages(staged("prepare", lambda name: [name]), staged("compute", list),
-                         staged("write", lambda x: Outcome(x[0], "done")), lambda x: None,
-                         lambda name, message, code: Outcome(name, "failed", message), Outcome)
+    stages = pool.Stages(
+        staged("prepare", lambda name: [name]),
+        staged("compute", list),
+        staged("write", lambda x: Outcome(x[0], "done")),
+        lambda x: None,
+        lambda name, message, code: Outcome(name, "failed", message),
+        Outcome,
+    )
     found = collect([f"{k}" for k in range(5)], stages=stages)
     assert {name: result.state for name, result in found.items()} == {f"{k}": "done" for k in range(5)}
 
@@ -380,8 +404,11 @@ def test_a_killed_dask_worker_costs_its_items_a_retry(cluster, tmp_path):
 
 @posix
 def test_workers_end_with_a_killed_parent(tmp_path):
-    parent = _script(tmp_path, "pool.run(STAGES, jobs('hang compute', 2) + jobs('', 20), workers=2, "
-                               "on_result=lambda r: print(r.name, flush=True))")
+    parent = _script(
+        tmp_path,
+        "pool.run(STAGES, jobs('hang compute', 2) + jobs('', 20), workers=2, "
+        "on_result=lambda r: print(r.name, flush=True))",
+    )
     _until(lambda: list(tmp_path.glob("*.hangs")), "a worker with an item")
     children = _children(parent.pid)
     assert len(children) >= 2
@@ -412,8 +439,9 @@ def _script(folder: Path, call: str) -> subprocess.Popen[str]:
     """
     path = folder / "script.py"
     path.write_text(textwrap.dedent(text))
-    return subprocess.Popen([sys.executable, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-                            start_new_session=True)  # a group of its own: a terminal's Ctrl-C goes to all of one
+    return subprocess.Popen(
+        [sys.executable, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )  # a group of its own: a terminal's Ctrl-C goes to all of one
 
 
 def _children(pid: int) -> list[int]:
@@ -437,8 +465,11 @@ def _alive(pid: int) -> bool:
 @posix
 @pytest.mark.parametrize("workers", [1, 2])
 def test_the_first_interrupt_finishes_what_is_in_flight(tmp_path, workers):
-    process = _script(tmp_path, f"pool.run(STAGES, iter(jobs('hang compute', 1000)), workers={workers}, "
-                                "on_result=lambda r: print('result', r.state, flush=True), on_notice=told)")
+    process = _script(
+        tmp_path,
+        f"pool.run(STAGES, iter(jobs('hang compute', 1000)), workers={workers}, "
+        "on_result=lambda r: print('result', r.state, flush=True), on_notice=told)",
+    )
     _until(lambda: len(list(tmp_path.glob("*.hangs"))) == workers, "items in all workers")
     os.killpg(process.pid, signal.SIGINT)
     assert process.stdout is not None
@@ -456,8 +487,11 @@ def test_the_first_interrupt_finishes_what_is_in_flight(tmp_path, workers):
 
 @posix
 def test_interrupts_never_reach_a_worker_even_while_it_starts(tmp_path):
-    process = _script(tmp_path, "pool.run(STAGES, jobs('sleep compute 0.01', 50), workers=2, "
-                                "on_result=lambda r: print(r.state, flush=True), on_notice=told)")
+    process = _script(
+        tmp_path,
+        "pool.run(STAGES, jobs('sleep compute 0.01', 50), workers=2, "
+        "on_result=lambda r: print(r.state, flush=True), on_notice=told)",
+    )
     while process.poll() is None:
         for pid in _children(process.pid):
             with contextlib.suppress(ProcessLookupError):
@@ -470,8 +504,11 @@ def test_interrupts_never_reach_a_worker_even_while_it_starts(tmp_path):
 @posix
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_second_interrupt_stops_and_abandons(tmp_path, workers):
-    process = _script(tmp_path, f"pool.run(STAGES, jobs('', 1) + jobs('hang compute', 50), workers={workers}, "
-                                "on_result=lambda r: print('result', flush=True))")
+    process = _script(
+        tmp_path,
+        f"pool.run(STAGES, jobs('', 1) + jobs('hang compute', 50), workers={workers}, "
+        "on_result=lambda r: print('result', flush=True))",
+    )
     _until(lambda: len(list(tmp_path.glob("*.hangs"))) == workers, "items in all workers")
     time.sleep(0.3)  # the next are read ahead
     children = _children(process.pid)
@@ -517,8 +554,13 @@ def test_a_limit_of_cores_is_obeyed(device):
     if device.type != "cpu":
         pytest.skip("a GPU is shared by all workers")
     environment = {**os.environ, **core_limit(1)}
-    done = subprocess.run([sys.executable, "-c", BUSY.format(name=f"{device.platform}: {device.name}")],
-                          env=environment, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", BUSY.format(name=f"{device.platform}: {device.name}")],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     # The launching thread may run a little beside the kernel's: 1.01 was the most seen. Two cores would be 2.
     assert float(done.stdout) < 1.2
 
@@ -561,20 +603,39 @@ def test_the_cores_are_divided_among_the_workers(monkeypatch):
 def scheduler(tmp_path):
     """A scheduler and one worker, each a process of its own that may be killed: (address, scheduler, worker)."""
     pytest.importorskip("distributed")
-    code = ("import asyncio, sys; from distributed import Scheduler\n"
-            "async def main():\n"
-            "    async with Scheduler(host='127.0.0.1', port=0, dashboard=False) as s:\n"
-            "        print(s.address, flush=True); await s.finished()\n"
-            "asyncio.run(main())")
+    code = (
+        "import asyncio, sys; from distributed import Scheduler\n"
+        "async def main():\n"
+        "    async with Scheduler(host='127.0.0.1', port=0, dashboard=False) as s:\n"
+        "        print(s.address, flush=True); await s.finished()\n"
+        "asyncio.run(main())"
+    )
     quiet = {"stderr": subprocess.DEVNULL, "text": True}
     first = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, **quiet)
     assert first.stdout is not None
     address = first.stdout.readline().strip()
     path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    second = subprocess.Popen([sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "4",
-                               "--no-nanny", "--no-dashboard", "--resources", "OPENCL=1", "--local-directory",
-                               str(tmp_path / "dask"), "--death-timeout", "5"],
-                              stdout=subprocess.DEVNULL, env={**os.environ, "PYTHONPATH": path}, **quiet)
+    second = subprocess.Popen(
+        [
+            sys.executable,
+            "-m",
+            "distributed.cli.dask_worker",
+            address,
+            "--nthreads",
+            "4",
+            "--no-nanny",
+            "--no-dashboard",
+            "--resources",
+            "OPENCL=1",
+            "--local-directory",
+            str(tmp_path / "dask"),
+            "--death-timeout",
+            "5",
+        ],
+        stdout=subprocess.DEVNULL,
+        env={**os.environ, "PYTHONPATH": path},
+        **quiet,
+    )
     yield address, first, second
     for process in (first, second):
         process.kill()
@@ -599,8 +660,10 @@ def test_a_lost_scheduler_is_a_clear_end(scheduler, tmp_path, count):
         pool.run(STAGES, jobs, scheduler=address, on_result=lambda result: found.append(result.name))
     killer.join()
     done = len(set(found))
-    assert str(caught.value) == (f"the scheduler at {address} is gone: {done} item{' was' if done == 1 else 's were'} "
-                                 "done before; run it again to go on with the rest")
+    assert str(caught.value) == (
+        f"the scheduler at {address} is gone: {done} item{' was' if done == 1 else 's were'} "
+        "done before; run it again to go on with the rest"
+    )
     assert done < count
 
 
@@ -625,10 +688,13 @@ def test_a_worker_with_another_version_is_refused(cluster, monkeypatch):
     assert pool._do(STAGES, Job("a"), "8.8").message == "its worker has whitefurnace 9.9, the batch 8.8"
 
 
-@pytest.mark.parametrize("address, error, told", [
-    ("tcp://127.0.0.1:1", FileError, "no scheduler answers at tcp://127.0.0.1:1"),
-    ("nowhere://127.0.0.1:8786", UsageError, "is no address of a scheduler"),
-])
+@pytest.mark.parametrize(
+    "address, error, told",
+    [
+        ("tcp://127.0.0.1:1", FileError, "no scheduler answers at tcp://127.0.0.1:1"),
+        ("nowhere://127.0.0.1:8786", UsageError, "is no address of a scheduler"),
+    ],
+)
 def test_an_address_where_nobody_answers_is_told(address, error, told, monkeypatch):
     pytest.importorskip("distributed")
     monkeypatch.setattr(pool, "CONNECT_SECONDS", 1)
@@ -644,8 +710,15 @@ def test_a_cluster_without_the_resource_is_waited_for_and_told():
         told.append(text)
         stop.set()
 
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0",
-                                  protocol="tcp", host="127.0.0.1", scheduler_port=0) as local:
+    with distributed.LocalCluster(
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        dashboard_address=":0",
+        protocol="tcp",
+        host="127.0.0.1",
+        scheduler_port=0,
+    ) as local:
         assert collect([Job("a")], scheduler=local.scheduler_address, on_notice=notice, stop=stop) == {}
     assert len(told) == 1 and "declares OPENCL=1" in told[0]
 
@@ -655,8 +728,11 @@ def test_an_interrupt_ends_a_run_on_a_cluster(scheduler, tmp_path):
     address, *_ = scheduler
     folder = tmp_path / "jobs"
     folder.mkdir()
-    process = _script(folder, f"pool.run(STAGES, iter(jobs('hang compute', 1000)), scheduler={address!r}, "
-                              "on_result=lambda r: print('result', r.state, flush=True), on_notice=told)")
+    process = _script(
+        folder,
+        f"pool.run(STAGES, iter(jobs('hang compute', 1000)), scheduler={address!r}, "
+        "on_result=lambda r: print('result', r.state, flush=True), on_notice=told)",
+    )
     _until(lambda: list(folder.glob("*.hangs")), "an item on the worker")
     os.killpg(process.pid, signal.SIGINT)
     assert process.stdout is not None

@@ -1,4 +1,5 @@
 """Benchmarks run, count what they say they count, and say it as they should; how fast anything is is nobody's test."""
+
 from __future__ import annotations
 
 import importlib.util
@@ -39,8 +40,9 @@ def meter(device: Device) -> BenchMeter:
 
 
 def run(*arguments: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "whitefurnace", "bench", *arguments], cwd=cwd, capture_output=True,
-                          text=True)
+    return subprocess.run(
+        [sys.executable, "-m", "whitefurnace", "bench", *arguments], cwd=cwd, capture_output=True, text=True
+    )
 
 
 # ---------------------------------------------------------------------------------------------- yardsticks
@@ -57,8 +59,9 @@ def test_multiply_adds_are_done(device: Device, precision: int) -> None:
     for rounds, part in ((0, None), (1, 2.0**-4), (16, 0.0)):  # a round halves the distance four times
         start = np.linspace(1, 2, benching.CHAINS * lanes)
         out = device.empty((items, lanes), kind)
-        device.launch(kernel, (items,), (out, np.int32(rounds), kind.type(0.5), kind.type(0.25),
-                                         device.array(start.astype(kind))))
+        device.launch(
+            kernel, (items,), (out, np.int32(rounds), kind.type(0.5), kind.type(0.25), device.array(start.astype(kind)))
+        )
         away = (start.reshape(benching.CHAINS, lanes) - 0.5).sum(0)
         want = 6 + away * (1 if part is None else part)
         # 12 terms, each rounded a few times; the last distance is 2^-64.
@@ -135,15 +138,18 @@ def test_names() -> None:
 # ---------------------------------------------------------------------------------------------- the front
 
 
-@pytest.mark.parametrize("points, front", [
-    ([], []),
-    ([(1, 1)], [0]),
-    ([(1, 4), (2, 3), (3, 3.5), (4, 1), (0.5, 9)], [4, 0, 1, 3]),  # (3, 3.5) is slower and worse than (2, 3)
-    ([(1, 1), (1, 1)], [0]),  # equal ones: the first
-    ([(1, 2), (1, 1)], [1]),  # as fast and better
-    ([(1, 1), (2, 1)], [0]),  # as good and slower
-    ([(1, math.nan), (math.nan, 0), (2, 1), (math.inf, 0)], [2]),
-])
+@pytest.mark.parametrize(
+    "points, front",
+    [
+        ([], []),
+        ([(1, 1)], [0]),
+        ([(1, 4), (2, 3), (3, 3.5), (4, 1), (0.5, 9)], [4, 0, 1, 3]),  # (3, 3.5) is slower and worse than (2, 3)
+        ([(1, 1), (1, 1)], [0]),  # equal ones: the first
+        ([(1, 2), (1, 1)], [1]),  # as fast and better
+        ([(1, 1), (2, 1)], [0]),  # as good and slower
+        ([(1, math.nan), (math.nan, 0), (2, 1), (math.inf, 0)], [2]),
+    ],
+)
 def test_front(points: list[tuple[float, float]], front: list[int]) -> None:
     assert tradeoff.front(points) == front
 
@@ -167,8 +173,9 @@ def light() -> np.ndarray:
 
 def test_points(device: Device, light: np.ndarray) -> None:
     env = environment(light)
-    found = list(tradeoff.points(env, device, size=16, min_size=4, runs=1,
-                                 todo=[("tolerance", 1e-2), ("tolerance", 1e-3)]))
+    found = list(
+        tradeoff.points(env, device, size=16, min_size=4, runs=1, todo=[("tolerance", 1e-2), ("tolerance", 1e-3)])
+    )
     assert [p.setting for p in found] == [1e-2, 1e-3]
     for p in found:
         assert isinstance(p, Point) and p.runs == 1 and len(p.rules) == 3
@@ -191,10 +198,19 @@ def test_a_missed_point_is_told(device: Device, light: np.ndarray, monkeypatch: 
 
 
 def test_costs(device: Device, light: np.ndarray) -> None:
-    found = list(tradeoff.costs(environment(light), device, size=16, min_size=4, runs=1, sizes=(8, 16), rows=(8, 16),
-                                alphas=(0.1, 1.0)))
-    assert [(c.over, c.value) for c in found] == [("output size", 8), ("output size", 16), ("source rows", 8),
-                                                  ("source rows", 16), ("alpha", 0.1), ("alpha", 1.0)]
+    found = list(
+        tradeoff.costs(
+            environment(light), device, size=16, min_size=4, runs=1, sizes=(8, 16), rows=(8, 16), alphas=(0.1, 1.0)
+        )
+    )
+    assert [(c.over, c.value) for c in found] == [
+        ("output size", 8),
+        ("output size", 16),
+        ("source rows", 8),
+        ("source rows", 16),
+        ("alpha", 0.1),
+        ("alpha", 1.0),
+    ]
     assert all(0 < c.seconds.low <= c.seconds.median <= c.seconds.high for c in found)
 
 
@@ -217,14 +233,32 @@ def test_few_runs_within_the_budget() -> None:
 
 
 def point(method: str, setting: float, seconds: float, error: float, front: bool) -> Point:
-    return Point("sky", method, setting, Spread(seconds, 0.9 * seconds, 1.1 * seconds), 0.01, error, error, error / 9,
-                 100, ("texel-mean",), 3, front)
+    return Point(
+        "sky",
+        method,
+        setting,
+        Spread(seconds, 0.9 * seconds, 1.1 * seconds),
+        0.01,
+        error,
+        error,
+        error / 9,
+        100,
+        ("texel-mean",),
+        3,
+        front,
+    )
 
 
-POINTS = [point("tolerance", 1e-2, 0.02, 5e-3, True), point("tolerance", 1e-3, 0.1, 5e-4, True),
-          point("samples", 1024, 0.5, 5e-2, False)]
-COSTS = [Cost("sky", over, value, Spread(value, value, value), 1) for over in ("output size", "source rows", "alpha")
-         for value in (0.5, 1.0)]
+POINTS = [
+    point("tolerance", 1e-2, 0.02, 5e-3, True),
+    point("tolerance", 1e-3, 0.1, 5e-4, True),
+    point("samples", 1024, 0.5, 5e-2, False),
+]
+COSTS = [
+    Cost("sky", over, value, Spread(value, value, value), 1)
+    for over in ("output size", "source rows", "alpha")
+    for value in (0.5, 1.0)
+]
 
 
 def test_text_and_json() -> None:
@@ -254,8 +288,9 @@ def test_the_script_that_fills_the_page(device: Device, meter: BenchMeter) -> No
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     measured = list(benching.throughput(benching.cases(("evaluate", "demo")), device, meter, runs=1))
-    said, head, table = script.throughput([*map(printed.bench_row, measured),
-                                           printed.yardstick_row(meter.yardstick(), device.identity())])
+    said, head, table = script.throughput(
+        [*map(printed.bench_row, measured), printed.yardstick_row(meter.yardstick(), device.identity())]
+    )
     assert device.identity()["name"] in said
     assert [row[:2] for row in table] == [["evaluate", "cells"], ["demo", "points"]]
     assert all(len(row) == len(head) for row in table)
@@ -298,24 +333,32 @@ def test_command_tradeoff(tmp_path: Path, light: np.ndarray, small: Callable[[],
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
     """Fewer points: what the command does with them does not need more."""
+
     def shrink() -> None:
         monkeypatch.setattr(plot_style, "DPI", 40)
         monkeypatch.setattr(tradeoff, "TOLERANCES", (1e-2, 1e-3))
         monkeypatch.setattr(tradeoff, "SAMPLES", (32,))
-        monkeypatch.setattr(tradeoff.costs, "__kwdefaults__", {
-            **tradeoff.costs.__kwdefaults__, "sizes": (16,), "rows": (16,), "alphas": (0.5,)})
+        monkeypatch.setattr(
+            tradeoff.costs,
+            "__kwdefaults__",
+            {**tradeoff.costs.__kwdefaults__, "sizes": (16,), "rows": (16,), "alphas": (0.5,)},
+        )
+
     return shrink
 
 
-@pytest.mark.parametrize("arguments, said", [
-    (("convolvee",), "did you mean 'convolve'"),
-    (("--size", "64"), "--size is of `bench tradeoff ENV...`"),
-    (("dfg", "--plot", "figures"), "--plot is of `bench tradeoff ENV...`"),
-    (("--runs", "0"), "runs 0 is outside [1, 1000]"),
-    (("tradeoff",), "wants one environment"),
-    (("tradeoff", "demo", "--size", "63"), "size 63 is not a power of two"),
-    (("tradeoff", "demo", "--min-size", "512"), "min-size 512 is larger than size 256"),
-])
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        (("convolvee",), "did you mean 'convolve'"),
+        (("--size", "64"), "--size is of `bench tradeoff ENV...`"),
+        (("dfg", "--plot", "figures"), "--plot is of `bench tradeoff ENV...`"),
+        (("--runs", "0"), "runs 0 is outside [1, 1000]"),
+        (("tradeoff",), "wants one environment"),
+        (("tradeoff", "demo", "--size", "63"), "size 63 is not a power of two"),
+        (("tradeoff", "demo", "--min-size", "512"), "min-size 512 is larger than size 256"),
+    ],
+)
 def test_bad_usage(arguments: tuple[str, ...], said: str) -> None:
     from click.testing import CliRunner
 

@@ -1,4 +1,5 @@
 """Entries of the catalogue as wholes: the papers that they cite, what they state, and that a new one is two files."""
+
 from __future__ import annotations
 
 import os
@@ -49,17 +50,32 @@ def test_every_citation_is_in_the_bibliography() -> None:
 
 
 def test_the_list_has_no_paper_that_nobody_cites() -> None:
-    texts = [path.read_text("utf-8") for path in [*KERNELS.rglob("*.cl*"), *HOST.rglob("*.py")]
-             if path.name != "bibliography.py"]
+    texts = [
+        path.read_text("utf-8")
+        for path in [*KERNELS.rglob("*.cl*"), *HOST.rglob("*.py")]
+        if path.name != "bibliography.py"
+    ]
     assert not [key for key in SHARED if not any(key in text for text in texts)]
 
 
 def test_a_listing_shows_checks_among_the_notes() -> None:
-    entry = Model("masking", "m", "M", Paper("", ""), (), (), {},
-                  checks=Checks(reciprocal=True, slow_rules=8.0, negative=True), notes={"follows roughness": False,
-                                                                                       "caution": "none"})
-    assert list(entry.facts.items()) == [("reciprocal", True), ("follows roughness", False), ("slow rules", 8.0),
-                                         ("caution", "none")]
+    entry = Model(
+        "masking",
+        "m",
+        "M",
+        Paper("", ""),
+        (),
+        (),
+        {},
+        checks=Checks(reciprocal=True, slow_rules=8.0, negative=True),
+        notes={"follows roughness": False, "caution": "none"},
+    )
+    assert list(entry.facts.items()) == [
+        ("reciprocal", True),
+        ("follows roughness", False),
+        ("slow rules", 8.0),
+        ("caution", "none"),
+    ]
     assert Model("masking", "m", "M", Paper("", ""), (), (), {}).facts == {}
 
 
@@ -117,10 +133,15 @@ def test_a_new_model_is_its_kernel_and_its_entry(device: Device, tmp_path: Path)
     (package / "catalogue" / "ndf" / "bowl.py").write_text(ENTRY, "utf-8")
 
     def run(*words: str) -> str:
-        done = subprocess.run([sys.executable, "-m", "whitefurnace", *words], cwd=tmp_path, capture_output=True,
-                              text=True, encoding="utf-8", timeout=300,
-                              env={**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONUTF8": "1",
-                                   "WHITEFURNACE_DEVICE": device.address})
+        done = subprocess.run(
+            [sys.executable, "-m", "whitefurnace", *words],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            encoding="utf-8",
+            timeout=300,
+            env={**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONUTF8": "1", "WHITEFURNACE_DEVICE": device.address},
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
@@ -129,6 +150,11 @@ def test_a_new_model_is_its_kernel_and_its_entry(device: Device, tmp_path: Path)
     told = run("verify", "bowl", "--precision", "32")
     assert "normalization" in told and "weak furnace, smith" in told and "sampler, chi²" in told
     listed = "from whitefurnace.catalogue.bibliography import bibliography; print(*bibliography())"
-    found = subprocess.run([sys.executable, "-c", listed], cwd=tmp_path, capture_output=True, text=True,
-                           env={**os.environ, "PYTHONPATH": str(tmp_path)})
+    found = subprocess.run(
+        [sys.executable, "-c", listed],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
     assert "Nobody2030" in found.stdout, found.stderr

@@ -1,5 +1,6 @@
 """The NDFs of the catalogue: kernels against float64 references over the whole domain, references against mpmath and
 against closed truths. What holds for every NDF is parametrised over the catalogue."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -33,30 +34,47 @@ def kernel_file(name: str) -> str:
     return (resources.files("whitefurnace.kernels") / name).read_text("utf-8")
 
 
-def evaluate(device: Device, precision: int, expression: str, rows: Mapping[str, np.ndarray], *,
-             file: str | None = None, lanes: int | None = None) -> np.ndarray:
+def evaluate(
+    device: Device,
+    precision: int,
+    expression: str,
+    rows: Mapping[str, np.ndarray],
+    *,
+    file: str | None = None,
+    lanes: int | None = None,
+) -> np.ndarray:
     """`expression` of the kernel files over `rows`, arrays of one length by the name the expression uses."""
     lanes = lanes or device.lanes(precision)
     dtype = np.float32 if precision == 32 else np.float64
     count = len(next(iter(rows.values())))
     pad = -count % (lanes * device.local_size)
-    text = "\n".join([
-        *(kernel_file(f) for f in ("real.clh", "special.clh", file) if f),
-        "__kernel void each(__global scalar *out" + "".join(f", __global const scalar *{n}_" for n in rows) + ") {",
-        "  const int g = get_global_id(0);",
-        *(f"  const real {n} = LOAD(g, {n}_);" for n in rows),
-        f"  STORE({expression}, g, out);\n}}",
-    ])
+    text = "\n".join(
+        [
+            *(kernel_file(f) for f in ("real.clh", "special.clh", file) if f),
+            "__kernel void each(__global scalar *out" + "".join(f", __global const scalar *{n}_" for n in rows) + ") {",
+            "  const int g = get_global_id(0);",
+            *(f"  const real {n} = LOAD(g, {n}_);" for n in rows),
+            f"  STORE({expression}, g, out);\n}}",
+        ]
+    )
     program = device.build(text, {"W": lanes, "T": 1, "PRECISION": precision})
-    buffers = [device.array(np.pad(np.asarray(r, np.float64), (0, pad), mode="edge").astype(dtype))
-               for r in rows.values()]
+    buffers = [
+        device.array(np.pad(np.asarray(r, np.float64), (0, pad), mode="edge").astype(dtype)) for r in rows.values()
+    ]
     out = device.empty(count + pad, dtype)
     device.launch(program.kernel("each"), ((count + pad) // lanes,), [out, *buffers])
     return out.read()[:count].astype(np.float64)
 
 
-def call(device: Device, precision: int, entry: Model, function: str, own: Mapping[str, np.ndarray],
-         parameters: Mapping[str, np.ndarray], **options: Any) -> np.ndarray:
+def call(
+    device: Device,
+    precision: int,
+    entry: Model,
+    function: str,
+    own: Mapping[str, np.ndarray],
+    parameters: Mapping[str, np.ndarray],
+    **options: Any,
+) -> np.ndarray:
     """A kernel function of `entry`; `own` arguments x, y, z make one vector."""
     names = list(own)
     arguments = ["vec3(x, y, z)", *names[3:]] if names[:3] == ["x", "y", "z"] else names
@@ -77,8 +95,9 @@ def message(wrong: np.ndarray, error: np.ndarray, got: np.ndarray, wanted: np.nd
     """The worst of the wrong points: inputs, got, wanted, error."""
     k = int(np.argmax(np.where(wrong, error, -1)))
     at = ", ".join(f"{n}={v[k]:.9g}" for n, v in inputs.items())
-    return (f"{int(wrong.sum())} of {wrong.size}; worst at {at}: got {got[k]!r}, wanted {wanted[k]!r}, "
-            f"error {error[k]:.2e}")
+    return (
+        f"{int(wrong.sum())} of {wrong.size}; worst at {at}: got {got[k]!r}, wanted {wanted[k]!r}, error {error[k]:.2e}"
+    )
 
 
 # ---------------------------------------------------------------------------------------------- domains
@@ -88,14 +107,27 @@ def axis(p: Parameter, count: int = 9) -> np.ndarray:
     """Values of a parameter, log-spaced, its ends and the exponents 1 and 2 approached from both sides."""
     low = p.low if p.low > 0 else p.high * 1e-9
     near = [e + d for e in (1, 2) for d in (-1e-3, -1e-6, 0, 1e-6, 1e-3)]
-    values = [p.low, *np.geomspace(low, p.high, count), *p.typical, *(p.high * (1 - 10.0**-k) for k in (1, 3, 6)),
-              *(v for v in near if p.low < v < p.high)]
+    values = [
+        p.low,
+        *np.geomspace(low, p.high, count),
+        *p.typical,
+        *(p.high * (1 - 10.0**-k) for k in (1, 3, 6)),
+        *(v for v in near if p.low < v < p.high),
+    ]
     return np.unique(np.clip(float32(values), p.low, p.high))
 
 
 # From 1e-8 to π/2, the ends thicker. Beyond π/2 by a rounding the cosine is negative: not asked here.
-THETA = np.unique(np.concatenate([np.geomspace(1e-8, 1.57, 121), np.pi / 2 - np.geomspace(1e-8, 1.5, 60),
-                                  np.linspace(0.01, 1.57, 30), [0.0, np.pi / 2]]))
+THETA = np.unique(
+    np.concatenate(
+        [
+            np.geomspace(1e-8, 1.57, 121),
+            np.pi / 2 - np.geomspace(1e-8, 1.5, 60),
+            np.linspace(0.01, 1.57, 30),
+            [0.0, np.pi / 2],
+        ]
+    )
+)
 PHI = np.array([0, 1e-4, 0.3, np.pi / 4, 1.2, np.pi / 2 - 1e-3, np.pi / 2, 2, np.pi])
 
 
@@ -107,7 +139,7 @@ def domain(entry: Model, *others: np.ndarray) -> tuple[dict[str, np.ndarray], li
     """The product of every parameter's `axis` and `others`, flattened: parameters by name, and the others."""
     axes = [axis(p, 9 if entry.isotropic else 5) for p in entry.parameters]
     flat = [v.ravel() for v in np.meshgrid(*axes, *others, indexing="ij")]
-    return ({p.name: v for p, v in zip(entry.parameters, flat, strict=False)}, flat[len(axes):])
+    return ({p.name: v for p, v in zip(entry.parameters, flat, strict=False)}, flat[len(axes) :])
 
 
 def coordinates(entry: Model, angles: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
@@ -123,8 +155,10 @@ def corners(name: str) -> list[dict[str, float]]:
     """Some points of the domain: the ends and the middle of each parameter."""
     entry = models("ndf")[name]
     axes = [np.unique([p.low, p.typical[1], p.typical[len(p.typical) // 2], p.high]) for p in entry.parameters]
-    return [dict(zip((p.name for p in entry.parameters), map(float, values), strict=True))
-            for values in np.stack([v.ravel() for v in np.meshgrid(*axes)], -1)]
+    return [
+        dict(zip((p.name for p in entry.parameters), map(float, values), strict=True))
+        for values in np.stack([v.ravel() for v in np.meshgrid(*axes)], -1)
+    ]
 
 
 # ---------------------------------------------------------------------------------------------- special.clh
@@ -145,8 +179,9 @@ SPECIAL = [
 
 
 @PRECISIONS
-@pytest.mark.parametrize(("expression", "truth", "low", "high", "tolerance", "grows"), SPECIAL,
-                         ids=[s[0] for s in SPECIAL])
+@pytest.mark.parametrize(
+    ("expression", "truth", "low", "high", "tolerance", "grows"), SPECIAL, ids=[s[0] for s in SPECIAL]
+)
 def test_special_functions(device, precision, expression, truth, low, high, tolerance, grows):
     x = [np.linspace(max(low, -3), min(high, 3), 20001)]
     if low <= 0:
@@ -249,8 +284,9 @@ def test_D_and_what_comes_with_it_stays_finite_at_the_ends(device, precision, na
         functions.append(("sample", {"u": u}))
     for function, arguments in functions:
         repeats = len(next(iter(arguments.values()))) // len(next(iter(parameters.values())))
-        got = call(device, precision, entry, function, arguments,
-                   {n: np.repeat(v, repeats) for n, v in parameters.items()})
+        got = call(
+            device, precision, entry, function, arguments, {n: np.repeat(v, repeats) for n, v in parameters.items()}
+        )
         assert np.isfinite(got).all() and (got >= 0).all(), function
 
 
@@ -269,8 +305,13 @@ def nodes(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
     return (edges[:-1, None] + width * (1 + x) / 2).ravel(), (width * w / 2).ravel()
 
 
-def energy(entry: Model, parameters: Mapping[str, float], low: float = -30.0, high: float = 40.0,
-           stretch: tuple[float, float] | None = None) -> float:
+def energy(
+    entry: Model,
+    parameters: Mapping[str, float],
+    low: float = -30.0,
+    high: float = 40.0,
+    stretch: tuple[float, float] | None = None,
+) -> float:
     """∫ D cos θ dω over e^low < tan θ < e^high; for anisotropic NDFs over the stretched tangent
     r, slopes (αx r cos φ, αy r sin φ): cos θ dω = αx αy r dr dφ cos⁴θ."""
     y, w = nodes(low, high)
@@ -289,8 +330,10 @@ def stretch_of(device: Device, entry: Model, parameters: Mapping[str, float]) ->
     if entry.isotropic:
         return None
     rows = {n: np.full(1, v) for n, v in parameters.items()}
-    x, y = (float(evaluate(device, 64, f"ndf_{entry.name}_{f}({', '.join(rows)})", rows, file=entry.kernel_file)[0])
-            for f in ("stretch_x", "stretch_y"))
+    x, y = (
+        float(evaluate(device, 64, f"ndf_{entry.name}_{f}({', '.join(rows)})", rows, file=entry.kernel_file)[0])
+        for f in ("stretch_x", "stretch_y")
+    )
     return x, y
 
 
@@ -319,7 +362,7 @@ def closed(name: str, **parameters: float) -> Any:
         return (q["exponent"] + 2) / (2 * mp.pi) * mp.cos(t) ** q["exponent"]
 
     def beckmann(t):
-        return mp.exp(-mp.tan(t) ** 2 / q["alpha"] ** 2) / (mp.pi * q["alpha"] ** 2 * mp.cos(t) ** 4)
+        return mp.exp(-(mp.tan(t) ** 2) / q["alpha"] ** 2) / (mp.pi * q["alpha"] ** 2 * mp.cos(t) ** 4)
 
     def ggx(t):
         return q["alpha"] ** 2 / (mp.pi * (mp.cos(t) ** 2 * (q["alpha"] ** 2 - 1) + 1) ** 2)
@@ -327,8 +370,7 @@ def closed(name: str, **parameters: float) -> Any:
     def abc(t):  # Hoffman's norm; its poles, and b = 0, by a shift far below float64 at 90 digits
         b, c = q["b"] or mp.mpf(10) ** -30, q["c"]
         c += mp.mpf(10) ** -30 if c in (1, 2) else 0
-        k = (b**2 * (1 + b) ** c * (c - 2) * (c - 1)
-             / (2 * mp.pi * ((1 + b) ** 2 + (1 + b) ** c * (b * (c - 2) - 1))))
+        k = b**2 * (1 + b) ** c * (c - 2) * (c - 1) / (2 * mp.pi * ((1 + b) ** 2 + (1 + b) ** c * (b * (c - 2) - 1)))
         return k / (1 + b * (1 - mp.cos(t))) ** c
 
     def shifted_gamma(t):
@@ -357,8 +399,9 @@ def test_references_and_constants_against_mpmath(name):
     entry = models("ndf")[name]
     points = list(corners(name))
     if name == "shifted_gamma":
-        points += [{"alpha": a, "p": e + d} for a in (1e-4, 0.1, 1) for e in (1, 2) for d in (-1e-9, 0, 1e-9)
-                   if e + d <= 2]
+        points += [
+            {"alpha": a, "p": e + d} for a in (1e-4, 0.1, 1) for e in (1, 2) for d in (-1e-9, 0, 1e-9) if e + d <= 2
+        ]
     if name == "abc":
         points += [{"b": b, "c": e + d} for b in (0.3, 0.5, 0.51, 10, 1e8) for e in (1, 2) for d in (-1e-9, 0, 1e-9)]
     if name == "gtr":
@@ -405,19 +448,31 @@ def test_models_that_are_limits_of_others():
         # Each side rounds an exponent or a power of at most 1e4 of slopes: 1e-12 over the range where D counts.
         near = theta[theta < 30 * alpha]
         np.testing.assert_allclose(d("gtr", near, alpha=alpha, gamma=2.0), d("ggx", near, alpha=alpha), rtol=1e-12)
-        np.testing.assert_allclose(d("shifted_gamma", near, alpha=alpha, p=0.0),
-                                   d("beckmann", near, alpha=np.sqrt(alpha)), rtol=1e-12)
+        np.testing.assert_allclose(
+            d("shifted_gamma", near, alpha=alpha, p=0.0), d("beckmann", near, alpha=np.sqrt(alpha)), rtol=1e-12
+        )
         for kind in ("ggx", "beckmann"):
             for phi in PHI:
-                np.testing.assert_allclose(d(f"{kind}_anisotropic", near, phi, alpha_x=alpha, alpha_y=alpha),
-                                           d(kind, near, alpha=alpha), rtol=1e-12, atol=1e-300)
+                np.testing.assert_allclose(
+                    d(f"{kind}_anisotropic", near, phi, alpha_x=alpha, alpha_y=alpha),
+                    d(kind, near, alpha=alpha),
+                    rtol=1e-12,
+                    atol=1e-300,
+                )
                 np.testing.assert_allclose(
                     models("ndf")[f"{kind}_anisotropic"].reference["area"](theta, phi, alpha_x=alpha, alpha_y=alpha),
-                    models("ndf")[kind].reference["area"](theta, alpha=alpha), rtol=1e-14)
+                    models("ndf")[kind].reference["area"](theta, alpha=alpha),
+                    rtol=1e-14,
+                )
     uniform = np.full(theta.shape, 1 / np.pi)  # ∫ cos dω = π
-    for name, parameters in (("abc", {"b": 0.0, "c": 5.0}), ("abc", {"b": 1e8, "c": 0.0}), ("phong", {"exponent": 0.0}),
-                             ("gtr", {"alpha": 1.0, "gamma": 7.0}), ("gtr", {"alpha": 1e-4, "gamma": 0.0}),
-                             ("ggx", {"alpha": 1.0})):
+    for name, parameters in (
+        ("abc", {"b": 0.0, "c": 5.0}),
+        ("abc", {"b": 1e8, "c": 0.0}),
+        ("phong", {"exponent": 0.0}),
+        ("gtr", {"alpha": 1.0, "gamma": 7.0}),
+        ("gtr", {"alpha": 1e-4, "gamma": 0.0}),
+        ("ggx", {"alpha": 1.0}),
+    ):
         np.testing.assert_allclose(d(name, theta, **parameters), uniform, rtol=1e-13)
 
 
@@ -428,8 +483,9 @@ def test_models_that_are_limits_of_others():
 @PRECISIONS
 def test_area_against_its_reference(device, precision, name):
     entry = models("ndf")[name]
-    theta = np.unique(np.concatenate([[0.0], np.geomspace(1e-6, 1.57, 40), np.pi / 2 - np.geomspace(1e-12, 1, 40),
-                                      [np.pi / 2]]))
+    theta = np.unique(
+        np.concatenate([[0.0], np.geomspace(1e-6, 1.57, 40), np.pi / 2 - np.geomspace(1e-12, 1, 40), [np.pi / 2]])
+    )
     parameters, angles = domain(entry, *([theta] if entry.isotropic else [theta, PHI]))
     wanted = entry.reference["area"](*angles, **parameters)
     own = {"cos_v": np.cos(angles[0])} if entry.isotropic else coordinates(entry, angles)
@@ -488,8 +544,10 @@ def test_beckmann_area_against_mpmath(alpha):
             # In slopes: A = cos θv + ∫ (x sin θv - cos θv)₊ P(x) dx over the slope's Gaussian P of variance α²/2.
             c, s = mp.cos(theta), mp.sin(theta)
             first = c / s
-            beyond = mp.quad(lambda x, c=c, s=s: (x * s - c) * mp.exp(-(x / a) ** 2) / (a * mp.sqrt(mp.pi)),
-                             [first + k * a for k in (0, 1, 2, 4, 8, 16)])
+            beyond = mp.quad(
+                lambda x, c=c, s=s: (x * s - c) * mp.exp(-((x / a) ** 2)) / (a * mp.sqrt(mp.pi)),
+                [first + k * a for k in (0, 1, 2, 4, 8, 16)],
+            )
             assert abs(float(reference(theta, alpha=alpha)) / (c + beyond) - 1) <= 2e-15  # a few roundings
 
 
@@ -506,6 +564,7 @@ def test_anisotropic_area_against_quadrature(kind):
             slope = float(np.hypot(x, y))
             D = float(entry.reference["D"](np.arctan(slope), np.arctan2(y, x), alpha_x=ax, alpha_y=ay))
             return float(max(v[0] * x + v[1] * y + v[2], 0) * D / (1 + slope**2) ** 2 * ax * ay * r)
+
         along = v[0] * ax * np.cos(p) + v[1] * ay * np.sin(p)
         end = -v[2] / along if along < 0 else np.inf
         return integrate.quad(f, 0, end, epsabs=1e-12, limit=200)[0]
@@ -566,11 +625,16 @@ def test_samples_are_quantiles(device, precision, name):
         s = call(device, precision, entry, "sample", {"u": u}, rows)
         stretch = stretch_of(device, entry, parameters)
         for uk, sk in zip(u, s, strict=True):
-            def cdf(value: float, parameters: Mapping[str, float] = parameters,
-                    stretch: tuple[float, float] | None = stretch) -> float:
+
+            def cdf(
+                value: float,
+                parameters: Mapping[str, float] = parameters,
+                stretch: tuple[float, float] | None = stretch,
+            ) -> float:
                 tan2 = value / max(1 - value, 1e-300) if stretch is None else value
                 y = float(np.clip(0.5 * np.log(tan2), -29.9, 40))
                 return energy(entry, parameters, -30.0, y, stretch)
+
             # 20 roundings of the quantile, 12 of which the exponent of γ = 10 or 1/(2α) takes, and the rule's 1e-12.
             room = 20 * epsilon
             high = min(sk * (1 + room), 1.0) if stretch is None else sk * (1 + room)
@@ -618,11 +682,20 @@ def test_conversions_are_inverses():
     assert roughness.alpha_of_exponent(0) == 1
 
 
-@pytest.mark.parametrize(("function", "bad"), [
-    (roughness.alpha_of_roughness, -0.1), (roughness.alpha_of_roughness, 1.1), (roughness.alpha_of_roughness, np.nan),
-    (roughness.roughness_of_alpha, -1e-9), (roughness.roughness_of_alpha, [0.5, 2]), (roughness.exponent_of_alpha, 0),
-    (roughness.exponent_of_alpha, 1.5), (roughness.alpha_of_exponent, -1), (roughness.alpha_of_exponent, np.inf),
-])
+@pytest.mark.parametrize(
+    ("function", "bad"),
+    [
+        (roughness.alpha_of_roughness, -0.1),
+        (roughness.alpha_of_roughness, 1.1),
+        (roughness.alpha_of_roughness, np.nan),
+        (roughness.roughness_of_alpha, -1e-9),
+        (roughness.roughness_of_alpha, [0.5, 2]),
+        (roughness.exponent_of_alpha, 0),
+        (roughness.exponent_of_alpha, 1.5),
+        (roughness.alpha_of_exponent, -1),
+        (roughness.alpha_of_exponent, np.inf),
+    ],
+)
 def test_conversions_refuse_what_lies_outside(function, bad):
     with pytest.raises(UsageError, match="outside"):
         function(bad)

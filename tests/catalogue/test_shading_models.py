@@ -1,5 +1,6 @@
 """Masking, Fresnel and diffuse models: kernels against their float64 references, limits, symmetry, and the facts that
 the entries state. A new model is tested by being there."""
+
 from __future__ import annotations
 
 import itertools
@@ -49,8 +50,9 @@ def inside(entry: Model, values: list[np.ndarray], precision: int) -> dict[str, 
     return {p.name: rounded(v, precision) for p, v in zip(entry.parameters, values, strict=True)}
 
 
-def evaluate(device: Device, function: str, slots: Mapping[str, Model], rows: list[np.ndarray], precision: int,
-             lanes: int | None) -> np.ndarray:
+def evaluate(
+    device: Device, function: str, slots: Mapping[str, Model], rows: list[np.ndarray], precision: int, lanes: int | None
+) -> np.ndarray:
     """A kernel function at `rows`: its own arguments, then each slot's parameters. Lanes past the end repeat."""
     kind, lanes = np.dtype(f"f{precision // 8}"), lanes or device.lanes(precision)
     program = device.build(source.evaluation(function, slots).text, {"W": lanes, "T": 1, "PRECISION": precision})
@@ -69,7 +71,8 @@ def check(got: np.ndarray, want: np.ndarray, allowed: np.ndarray | float, **inpu
     worst = int(np.argmax(excess))
     assert excess[worst] <= 1, (
         f"got {got[worst]!r}, want {np.broadcast_to(want, got.shape)[worst]!r}, error / allowed {excess[worst]:.3g} at "
-        + ", ".join(f"{name} = {np.array2string(np.asarray(v)[worst])}" for name, v in inputs.items()))
+        + ", ".join(f"{name} = {np.array2string(np.asarray(v)[worst])}" for name, v in inputs.items())
+    )
 
 
 @pytest.fixture(autouse=True)
@@ -96,8 +99,10 @@ def test_presets_and_typical_values_stay_in_the_domain(entry: Model) -> None:
 def directions(cos_l: np.ndarray, cos_v: np.ndarray, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """l and v, (..., 3), v in the plane of x."""
     sin_l, sin_v = (np.sqrt((1 - c) * (1 + c)) for c in (cos_l, cos_v))
-    return (np.stack([sin_l * np.cos(phi), sin_l * np.sin(phi), cos_l], -1),
-            np.stack([sin_v, np.zeros_like(sin_v), cos_v], -1))
+    return (
+        np.stack([sin_l * np.cos(phi), sin_l * np.sin(phi), cos_l], -1),
+        np.stack([sin_v, np.zeros_like(sin_v), cos_v], -1),
+    )
 
 
 def ggx_area(cosine: np.ndarray, alpha: np.ndarray) -> np.ndarray:
@@ -105,8 +110,9 @@ def ggx_area(cosine: np.ndarray, alpha: np.ndarray) -> np.ndarray:
     return (cosine + np.sqrt(cosine**2 + alpha**2 * (1 - cosine) * (1 + cosine))) / 2
 
 
-def pairs(entry: Model, precision: int, lights: np.ndarray = COSINES) -> tuple[list[np.ndarray], dict[str, np.ndarray],
-                                                                               np.ndarray]:
+def pairs(
+    entry: Model, precision: int, lights: np.ndarray = COSINES
+) -> tuple[list[np.ndarray], dict[str, np.ndarray], np.ndarray]:
     """(NoV, NoL, NoH, VoH, at_v, at_l), the model's parameters, and the α that made at_v and at_l."""
     own = parameters(entry) or [np.array([1e-4, 0.03, 0.3, 1.0])]
     NoV, NoL, phi, alpha = product(np.append(0.0, COSINES), lights, AZIMUTHS, own[0])
@@ -118,8 +124,16 @@ def pairs(entry: Model, precision: int, lights: np.ndarray = COSINES) -> tuple[l
     return rows, inside(entry, [alpha[keep]] * len(entry.parameters), precision), alpha[keep]
 
 
-def masked(device: Device, entry: Model, function: str, rows: list[np.ndarray], own: Mapping[str, np.ndarray],
-           alpha: np.ndarray, precision: int, lanes: int | None) -> np.ndarray:
+def masked(
+    device: Device,
+    entry: Model,
+    function: str,
+    rows: list[np.ndarray],
+    own: Mapping[str, np.ndarray],
+    alpha: np.ndarray,
+    precision: int,
+    lanes: int | None,
+) -> np.ndarray:
     """A function of a masking model; `smith` is built over GGX, which only its MASKING_AT would ask."""
     slots, extra = {"masking": entry}, []
     if entry.needs:
@@ -140,8 +154,12 @@ def test_masking_is_its_reference(entry: Model, device: Device, precision: int, 
         got = masked(device, entry, function, rows, own, alpha, precision, lanes)
         want = entry.reference[name](*rows, **own)
         known = np.isfinite(want)
-        check(np.where(known, got, 0.0), np.where(known, want, 0.0),
-              allowed * np.where(known, np.maximum(np.abs(want), 1e-30), 1.0), **names)
+        check(
+            np.where(known, got, 0.0),
+            np.where(known, want, 0.0),
+            allowed * np.where(known, np.maximum(np.abs(want), 1e-30), 1.0),
+            **names,
+        )
         assert np.isfinite(got).all()
 
 
@@ -176,8 +194,9 @@ def test_masking_is_as_reciprocal_as_it_says(entry: Model, device: Device, preci
     check(there, again, 6 * EPS[precision], NoV=rows[0], NoL=rows[1], **own)
 
 
-@pytest.mark.parametrize("entry", [m for m in models("masking").values() if "MASKING_G1" in m.provides],
-                         ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    "entry", [m for m in models("masking").values() if "MASKING_G1" in m.provides], ids=lambda m: m.name
+)
 @PRECISIONS
 def test_masking_of_one_direction(entry: Model, device: Device, precision: int) -> None:
     """G1 is its reference, and G with the light at the normal, which is never shadowed."""
@@ -200,10 +219,23 @@ def test_schlick_is_as_far_from_smith_as_its_entry_says() -> None:
         for alpha, most, furnace in zip((0.01, 0.1, 0.5, 1.0), less, deviation, strict=True):
             with np.errstate(divide="ignore"):
                 a = c / (alpha * np.sqrt((1 - c) * (1 + c)))
-                smith = (2 * c / (c + np.sqrt(c**2 + alpha**2 * (1 - c**2))) if ndf == "ggx" else
-                         # [Walter2007, eq. 26 by Λ]
-                         1 / (1 + np.array([float((mpmath.erf(x) - 1) / 2 + mpmath.exp(-x * x) /
-                                                  (2 * x * mpmath.sqrt(mpmath.pi))) if x < 30 else 0.0 for x in a])))
+                smith = (
+                    2 * c / (c + np.sqrt(c**2 + alpha**2 * (1 - c**2)))
+                    if ndf == "ggx"
+                    # [Walter2007, eq. 26 by Λ]
+                    else 1
+                    / (
+                        1
+                        + np.array(
+                            [
+                                float((mpmath.erf(x) - 1) / 2 + mpmath.exp(-x * x) / (2 * x * mpmath.sqrt(mpmath.pi)))
+                                if x < 30
+                                else 0.0
+                                for x in a
+                            ]
+                        )
+                    )
+                )
             own = schlick(c, None, alpha)
             assert np.min(own - smith) == pytest.approx(most, abs=6e-4), (ndf, alpha)
             # ∫ D G1 (v·m)₊ dω/(n·v) = G1 A/(n·v) = G1 over Smith's.
@@ -246,8 +278,10 @@ def test_fresnel_limits(entry: Model, device: Device, precision: int) -> None:
     own = inside(entry, product(*parameters(entry)) if entry.parameters else [], precision)
     count = len(next(iter(own.values()), [0.0]))
     at = {"at 0°": 1.0, "at 90°": 0.0}
-    zero, grazing = (evaluate(device, "FRESNEL_F", {"fresnel": entry}, [np.full(count, c), *own.values()], precision,
-                              None) for c in at.values())
+    zero, grazing = (
+        evaluate(device, "FRESNEL_F", {"fresnel": entry}, [np.full(count, c), *own.values()], precision, None)
+        for c in at.values()
+    )
     n, k = own.get("ior", own.get("eta")), own.get("kappa", 0.0)
     if n is not None:
         check(zero, ((n - 1) ** 2 + k**2) / ((n + 1) ** 2 + k**2), FRESNEL_ERROR[precision], **own)
@@ -286,8 +320,10 @@ def test_fresnel_is_the_same_from_the_other_side(device: Device, precision: int)
 
 @PRECISIONS
 def test_a_metal_without_extinction_is_an_insulator(device: Device, precision: int) -> None:
-    c, n = (rounded(a, precision) for a in product(np.append(0.0, COSINES),
-                                                   np.array([0.2, 0.7, 1.0, 1.0001, 1.333, 1.5, 2.5, 5.0])))
+    c, n = (
+        rounded(a, precision)
+        for a in product(np.append(0.0, COSINES), np.array([0.2, 0.7, 1.0, 1.0001, 1.333, 1.5, 2.5, 5.0]))
+    )
     metal = evaluate(device, "FRESNEL_F", {"fresnel": models("fresnel")["conductor"]}, [c, n, 0 * n], precision, None)
     glass = evaluate(device, "FRESNEL_F", {"fresnel": models("fresnel")["dielectric"]}, [c, n], precision, None)
     check(metal, glass, 2 * FRESNEL_ERROR[precision], c=c, n=n)
@@ -333,9 +369,16 @@ def test_fresnel_references_in_more_digits(c: float, eta: float, kappa: float) -
 
 # The tables of [Hoffman2012] as printed: the sRGB column belongs to the linear one that is stored.
 SRGB = {
-    "gold": (1.00, 0.86, 0.57), "silver": (0.98, 0.97, 0.95), "copper": (0.98, 0.82, 0.76),
-    "iron": (0.77, 0.78, 0.78), "aluminum": (0.96, 0.96, 0.97), "water": (0.15,) * 3, "plastic_low": (0.21,) * 3,
-    "plastic_high": (0.24,) * 3, "glass_high": (0.31,) * 3, "diamond": (0.45,) * 3,
+    "gold": (1.00, 0.86, 0.57),
+    "silver": (0.98, 0.97, 0.95),
+    "copper": (0.98, 0.82, 0.76),
+    "iron": (0.77, 0.78, 0.78),
+    "aluminum": (0.96, 0.96, 0.97),
+    "water": (0.15,) * 3,
+    "plastic_low": (0.21,) * 3,
+    "plastic_high": (0.24,) * 3,
+    "glass_high": (0.31,) * 3,
+    "diamond": (0.45,) * 3,
 }
 
 
@@ -373,8 +416,15 @@ def hemisphere_cells(entry: Model, precision: int) -> tuple[np.ndarray, np.ndarr
     return to_l, to_v, {p.name: np.minimum(own[p.name], p.high) for p in entry.parameters}
 
 
-def diffuse(device: Device, entry: Model, to_l: np.ndarray, to_v: np.ndarray, own: Mapping[str, np.ndarray],
-            precision: int, lanes: int | None = None) -> np.ndarray:
+def diffuse(
+    device: Device,
+    entry: Model,
+    to_l: np.ndarray,
+    to_v: np.ndarray,
+    own: Mapping[str, np.ndarray],
+    precision: int,
+    lanes: int | None = None,
+) -> np.ndarray:
     return evaluate(device, "DIFFUSE_F", {"diffuse": entry}, [*to_l.T, *to_v.T, *own.values()], precision, lanes)
 
 
@@ -431,12 +481,15 @@ ALBEDO_VIEWS = (1e-4, 0.01, 0.1, 0.3, 0.6, 0.9, 1.0)
 
 
 def settings(entry: Model) -> list[dict[str, float]]:
-    return [dict(zip((p.name for p in entry.parameters), values, strict=True))
-            for values in itertools.product(*(sorted({p.low, p.high, *p.typical}) for p in entry.parameters))]
+    return [
+        dict(zip((p.name for p in entry.parameters), values, strict=True))
+        for values in itertools.product(*(sorted({p.low, p.high, *p.typical}) for p in entry.parameters))
+    ]
 
 
-@pytest.mark.parametrize("entry", [m for m in models("diffuse").values() if "albedo" in m.reference],
-                         ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    "entry", [m for m in models("diffuse").values() if "albedo" in m.reference], ids=lambda m: m.name
+)
 def test_closed_albedo_is_the_integral(entry: Model) -> None:
     for own, NoV in itertools.product(settings(entry), ALBEDO_VIEWS):
         # Gauss of 48 nodes is exact to rounding for what is smooth; relative for Minnaert's 1e4.
@@ -453,9 +506,13 @@ def test_energy_is_as_declared(entry: Model) -> None:
         assert "albedo" in entry.reference
         return
     ranges = [np.linspace(p.low, p.high, 33) for p in entry.parameters if p.name != "albedo"]
-    found = max(directional_albedo(entry.reference["f"], NoV, dict(zip(
-        (p.name for p in entry.parameters), (1.0, *values), strict=True)))
-        for values in itertools.product(*(r[::len(ranges)] for r in ranges)) for NoV in (1e-6, *ALBEDO_VIEWS))
+    found = max(
+        directional_albedo(
+            entry.reference["f"], NoV, dict(zip((p.name for p in entry.parameters), (1.0, *values), strict=True))
+        )
+        for values in itertools.product(*(r[:: len(ranges)] for r in ranges))
+        for NoV in (1e-6, *ALBEDO_VIEWS)
+    )
     # Declared to four digits; the grid misses the worst parameter by a thirtieth of its range.
     assert found <= largest + 1e-4
     assert found == pytest.approx(largest, abs=2e-3)
@@ -471,8 +528,11 @@ def test_directional_albedo_by_an_adaptive_rule() -> None:
         return float(entry.reference["f"](to_l, to_v, **own)) * np.sin(theta) * np.cos(theta) * 2
 
     kink = np.arccos(NoV)
-    want = sum(quadrature.dblquad(radiance, a, b, c, d, epsabs=1e-10)[0]
-               for a, b in ((0, kink), (kink, np.pi / 2)) for c, d in ((0, np.pi / 2), (np.pi / 2, np.pi)))
+    want = sum(
+        quadrature.dblquad(radiance, a, b, c, d, epsabs=1e-10)[0]
+        for a, b in ((0, kink), (kink, np.pi / 2))
+        for c, d in ((0, np.pi / 2), (np.pi / 2, np.pi))
+    )
     assert directional_albedo(entry.reference["f"], NoV, own) == pytest.approx(want, abs=1e-9)
 
 
@@ -489,11 +549,14 @@ def test_white_eon_returns_everything(device: Device, precision: int) -> None:
     for roughness, NoV in itertools.product((0.0, 0.1, 0.5, 1.0), ALBEDO_VIEWS):
         # The error of the angle's fit, 3e-7 of at most a quarter, f's own rounding, and that of the quadrature.
         assert directional_albedo(f, NoV, {"albedo": 1.0, "roughness": roughness}) == pytest.approx(
-            1.0, abs=3 * EPS[precision] + 1e-14), (roughness, NoV)
+            1.0, abs=3 * EPS[precision] + 1e-14
+        ), (roughness, NoV)
 
 
-@pytest.mark.parametrize(("NoL", "NoV", "phi"), [(1e-5, 1e-5, 0.3), (1e-5, 1e-5, 3.0), (1e-5, 0.5, 2.0),
-                                                 (0.3, 0.7, 0.4), (0.3, 0.7, 2.2), (0.999, 1e-3, 1.0)])
+@pytest.mark.parametrize(
+    ("NoL", "NoV", "phi"),
+    [(1e-5, 1e-5, 0.3), (1e-5, 1e-5, 3.0), (1e-5, 0.5, 2.0), (0.3, 0.7, 0.4), (0.3, 0.7, 2.2), (0.999, 1e-3, 1.0)],
+)
 def test_diffuse_references_in_more_digits(NoL: float, NoV: float, phi: float) -> None:
     """Oren and Nayar's, Burley's and EON's formulas once more, in 40 digits."""
     rho, r = 0.8, 0.5
@@ -505,17 +568,24 @@ def test_diffuse_references_in_more_digits(NoL: float, NoV: float, phi: float) -
         c2 = mpmath.mpf("0.45") * k * (mpmath.sin(a) - ((2 * b / pi) ** 3 if cos_phi < 0 else 0))
         c3 = k / 8 * (4 * a * b / pi**2) ** 2
         want = {
-            "oren_nayar": rho / pi * (c1 + c2 * cos_phi * mpmath.tan(b) + (1 - abs(cos_phi)) * c3 *
-                                      mpmath.tan((a + b) / 2))
-            + mpmath.mpf("0.17") * mpmath.mpf(rho) ** 2 / pi * s2 / (s2 + mpmath.mpf("0.13")) *
-            (1 - cos_phi * (2 * b / pi) ** 2),
-            "oren_nayar_qualitative": rho / pi * (c1 + mpmath.mpf("0.45") * k * max(0, cos_phi) * mpmath.sin(a) *
-                                                  mpmath.tan(b)),
+            "oren_nayar": rho
+            / pi
+            * (c1 + c2 * cos_phi * mpmath.tan(b) + (1 - abs(cos_phi)) * c3 * mpmath.tan((a + b) / 2))
+            + mpmath.mpf("0.17")
+            * mpmath.mpf(rho) ** 2
+            / pi
+            * s2
+            / (s2 + mpmath.mpf("0.13"))
+            * (1 - cos_phi * (2 * b / pi) ** 2),
+            "oren_nayar_qualitative": rho
+            / pi
+            * (c1 + mpmath.mpf("0.45") * k * max(0, cos_phi) * mpmath.sin(a) * mpmath.tan(b)),
         }
         flat = mpmath.sin(tl) * mpmath.sin(tv) * cos_phi
         fd90 = mpmath.mpf("0.5") + 2 * r * (1 + flat + mpmath.cos(tl) * mpmath.cos(tv)) / 2
-        want["burley"] = rho / pi * (1 + (fd90 - 1) * (1 - mpmath.cos(tl)) ** 5) * (
-            1 + (fd90 - 1) * (1 - mpmath.cos(tv)) ** 5)
+        want["burley"] = (
+            rho / pi * (1 + (fd90 - 1) * (1 - mpmath.cos(tl)) ** 5) * (1 + (fd90 - 1) * (1 - mpmath.cos(tv)) ** 5)
+        )
         A = 1 / (1 + (mpmath.mpf("0.5") - 2 / (3 * pi)) * r)
         mean = A * (1 + (mpmath.mpf(2) / 3 - 28 / (15 * pi)) * r)
 
@@ -525,8 +595,9 @@ def test_diffuse_references_in_more_digits(NoL: float, NoV: float, phi: float) -
             return A + r * A / pi * (s * (t - s * mpmath.cos(t)) + 2 * mpmath.tan(t) * (1 - s**3) / 3 - 2 * s / 3)
 
         once = rho / pi * A * (1 + r * (flat / max(mpmath.cos(tl), mpmath.cos(tv)) if flat > 0 else flat))
-        want["eon"] = once + mpmath.mpf(rho) ** 2 * mean / (1 - rho * (1 - mean)) / pi * (
-            1 - fujii(tl)) * (1 - fujii(tv)) / (1 - mean)
+        want["eon"] = once + mpmath.mpf(rho) ** 2 * mean / (1 - rho * (1 - mean)) / pi * (1 - fujii(tl)) * (
+            1 - fujii(tv)
+        ) / (1 - mean)
     second = {"oren_nayar": "sigma", "oren_nayar_qualitative": "sigma", "burley": "roughness", "eon": "roughness"}
     for name, value in want.items():
         got = models("diffuse")[name].reference["f"](to_l, to_v, albedo=rho, **{second[name]: r})
@@ -538,8 +609,12 @@ def test_diffuse_references_in_more_digits(NoL: float, NoV: float, phi: float) -
 def test_diffuse_special_cases(device: Device, precision: int) -> None:
     """Roughness 0, exponent 1 and a surface that reflects nothing are Lambert."""
     lambert = models("diffuse")["lambert"]
-    same = {"oren_nayar": {"sigma": 0.0}, "oren_nayar_qualitative": {"sigma": 0.0}, "minnaert": {"exponent": 1.0},
-            "eon": {"roughness": 0.0}}
+    same = {
+        "oren_nayar": {"sigma": 0.0},
+        "oren_nayar_qualitative": {"sigma": 0.0},
+        "minnaert": {"exponent": 1.0},
+        "eon": {"roughness": 0.0},
+    }
     to_l, to_v, own = hemisphere_cells(lambert, precision)
     want = diffuse(device, lambert, to_l, to_v, own, precision)
     for name, extra in same.items():

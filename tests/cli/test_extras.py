@@ -1,4 +1,5 @@
 """A command that needs a package that is not installed says which, with exit code 5, before it computes anything."""
+
 from __future__ import annotations
 
 import json
@@ -39,23 +40,28 @@ def folder(tmp_path, monkeypatch):
 @pytest.fixture
 def no_kernels(monkeypatch):
     """Any kernel that runs is an error."""
+
     def launched(*_, **__):
         raise AssertionError("a kernel ran")
 
     monkeypatch.setattr(opencl.Device, "launch", launched)
 
 
-@pytest.mark.parametrize("missing, words", [
-    ("matplotlib", ["verify", "ggx", "--plot", "figures"]),
-    ("matplotlib", ["bench", "tradeoff", "demo", "--plot", "figures"]),
-    ("matplotlib", ["compare", "a.npy", "b.npy", "--plot", "figures"]),
-    ("pygltflib", ["scene", "scene.gltf"]),
-    ("pygltflib", ["scene", "scene.gltf", "--environment", "demo", "-o", "baked"]),
-    ("distributed", ["batch", "job.toml", "--scheduler", "tcp://127.0.0.1:8786"]),
-    ("ispc_texcomp", ["bake", "sky.hdr", "-o", "baked", "--for", "blocks.toml"]),
-    ("ispc_texcomp", ["bake", "sky.hdr", "-o", "baked", "--for", "raw,blocks.toml", "--json"]),
-    ("astc_encoder", ["bake", "sky.hdr", "-o", "baked", "--for", "astc.toml"]),
-], ids=lambda value: value if isinstance(value, str) else " ".join(value))
+@pytest.mark.parametrize(
+    "missing, words",
+    [
+        ("matplotlib", ["verify", "ggx", "--plot", "figures"]),
+        ("matplotlib", ["bench", "tradeoff", "demo", "--plot", "figures"]),
+        ("matplotlib", ["compare", "a.npy", "b.npy", "--plot", "figures"]),
+        ("pygltflib", ["scene", "scene.gltf"]),
+        ("pygltflib", ["scene", "scene.gltf", "--environment", "demo", "-o", "baked"]),
+        ("distributed", ["batch", "job.toml", "--scheduler", "tcp://127.0.0.1:8786"]),
+        ("ispc_texcomp", ["bake", "sky.hdr", "-o", "baked", "--for", "blocks.toml"]),
+        ("ispc_texcomp", ["bake", "sky.hdr", "-o", "baked", "--for", "raw,blocks.toml", "--json"]),
+        ("astc_encoder", ["bake", "sky.hdr", "-o", "baked", "--for", "astc.toml"]),
+    ],
+    ids=lambda value: value if isinstance(value, str) else " ".join(value),
+)
 def test_the_sentence_comes_before_the_work(folder, monkeypatch, shell, no_kernels, missing, words):
     for name in ("a.npy", "b.npy"):
         np.save(name, np.ones((4, 4, 2), np.float32))

@@ -1,4 +1,5 @@
 """The help of the command line: complete, grouped, never cut, and in agreement with the ranges that the code checks."""
+
 from __future__ import annotations
 
 import importlib
@@ -27,8 +28,20 @@ from whitefurnace.scenes.media import ROWS
 from whitefurnace.sphere.harmonics import CUTOFFS
 from whitefurnace.tables.kinds import kinds
 
-COMMANDS = ["bake", "batch", "bench", "compare", "devices", "engines", "inspect", "lut", "models", "render", "scene",
-            "verify"]
+COMMANDS = [
+    "bake",
+    "batch",
+    "bench",
+    "compare",
+    "devices",
+    "engines",
+    "inspect",
+    "lut",
+    "models",
+    "render",
+    "scene",
+    "verify",
+]
 
 
 def shown(*words: str, width: int = 110) -> str:
@@ -52,7 +65,8 @@ def test_a_new_command_is_one_file(tmp_path, monkeypatch):
     (tmp_path / "hello.py").write_text(
         "import click\nfrom whitefurnace.cli import options\n"
         "@options.command('Lists', 'Say hello', '')\n@options.as_json()\ndef hello(as_json):\n"
-        "    '''Say hello.'''\n    click.echo('hello')\n")
+        "    '''Say hello.'''\n    click.echo('hello')\n"
+    )
     monkeypatch.setattr(package, "__path__", [*package.__path__, str(tmp_path)])
     try:
         package._add_commands()
@@ -106,17 +120,32 @@ def test_commands_name_their_parameters(name):
     assert set(signature.parameters) == {p.name for p in cli.commands[name].params}
 
 
-@pytest.mark.parametrize("command, name, values", [
-    ("bake", "--size", recipe.SIZE_RANGE), ("bake", "--tolerance", recipe.TOLERANCE_RANGE),
-    ("bake", "--quality", [f"{name} ({value:.0e})".replace("e-0", "e-") for name, value in recipe.QUALITIES.items()]),
-    ("bake", "--samples", recipe.SAMPLES_RANGE), ("bake", "--certify", recipe.CERTIFY_RANGE),
-    ("bake", "--fit", recipe.FITS), ("bake", "--without", REDUCIBLE), ("bake", "--sh", CUTOFFS),
-    ("render", "--size", CELLS), ("render", "--exposure", (-EXPOSURES, EXPOSURES)), ("render", "--rows", COUNT_RANGE),
-    ("render", "--columns", COUNT_RANGE), ("render", "--tolerance", TRUTH_TOLERANCES),
-    ("scene", "--resolution", (1, ROWS)), ("scene", "--tolerance", BUDGET_TOLERANCES),
-    ("batch", "--workers", (1, MOST_WORKERS)),
-    ("lut", "--format", [*STORED[".ktx2"], *STORED[".dds"], *STORED[".png"]]),
-])
+@pytest.mark.parametrize(
+    "command, name, values",
+    [
+        ("bake", "--size", recipe.SIZE_RANGE),
+        ("bake", "--tolerance", recipe.TOLERANCE_RANGE),
+        (
+            "bake",
+            "--quality",
+            [f"{name} ({value:.0e})".replace("e-0", "e-") for name, value in recipe.QUALITIES.items()],
+        ),
+        ("bake", "--samples", recipe.SAMPLES_RANGE),
+        ("bake", "--certify", recipe.CERTIFY_RANGE),
+        ("bake", "--fit", recipe.FITS),
+        ("bake", "--without", REDUCIBLE),
+        ("bake", "--sh", CUTOFFS),
+        ("render", "--size", CELLS),
+        ("render", "--exposure", (-EXPOSURES, EXPOSURES)),
+        ("render", "--rows", COUNT_RANGE),
+        ("render", "--columns", COUNT_RANGE),
+        ("render", "--tolerance", TRUTH_TOLERANCES),
+        ("scene", "--resolution", (1, ROWS)),
+        ("scene", "--tolerance", BUDGET_TOLERANCES),
+        ("batch", "--workers", (1, MOST_WORKERS)),
+        ("lut", "--format", [*STORED[".ktx2"], *STORED[".dds"], *STORED[".png"]]),
+    ],
+)
 def test_help_has_the_ranges_and_names_of_the_code(command, name, values):
     text = option(command, name)
     numbers = {float(number) for number in re.findall(r"-?\b\d[\d.e+-]*\b|-\d+", text)}
@@ -125,11 +154,13 @@ def test_help_has_the_ranges_and_names_of_the_code(command, name, values):
 
 
 def test_help_of_every_command_is_quick_to_import():
-    script = ("import sys\nfrom whitefurnace.cli import main\n"
-              f"for words in ([], *([name] for name in {COMMANDS})):\n"
-              "    try: main([*words, '--help'])\n    except SystemExit as done: assert not done.code\n"
-              "heavy = {'numpy', 'scipy', 'pyopencl', 'OpenImageIO', 'rich', 'msgspec', 'matplotlib'} & "
-              "set(sys.modules)\nsys.exit(f'imported {heavy}' if heavy else 0)")
+    script = (
+        "import sys\nfrom whitefurnace.cli import main\n"
+        f"for words in ([], *([name] for name in {COMMANDS})):\n"
+        "    try: main([*words, '--help'])\n    except SystemExit as done: assert not done.code\n"
+        "heavy = {'numpy', 'scipy', 'pyopencl', 'OpenImageIO', 'rich', 'msgspec', 'matplotlib'} & "
+        "set(sys.modules)\nsys.exit(f'imported {heavy}' if heavy else 0)"
+    )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

@@ -4,6 +4,7 @@ What they render is held against the files, read as the preset says, against clo
 `make test-engines` installs the engines; without them all of this is skipped. WHITEFURNACE_NODE_MODULES names the
 folder with their packages, WHITEFURNACE_CHROMIUM another browser. Renders stay as PNG in the tests' folders.
 """
+
 from __future__ import annotations
 
 import itertools
@@ -70,8 +71,14 @@ HALF = math.sqrt(0.5)
 AXIS = np.array([0.36, 0.48, 0.8])
 """Of the red channel, oblique to all faces."""
 
-PATCHES = {(1, 0, 0): (3, 0), (-1, 0, 0): (0, 3), (0, 1, 0): (3, 3), (0, -1, 0): (1.5, 0), (0, 0, 1): (0, 1.5),
-           (0, 0, -1): (1.5, 3)}
+PATCHES = {
+    (1, 0, 0): (3, 0),
+    (-1, 0, 0): (0, 3),
+    (0, 1, 0): (3, 3),
+    (0, -1, 0): (1.5, 0),
+    (0, 0, 1): (0, 1.5),
+    (0, 0, -1): (1.5, 3),
+}
 """What is added to green and blue in each direction: no two alike."""
 
 SPREAD = 0.15
@@ -132,8 +139,9 @@ def normals_about(view: np.ndarray) -> np.ndarray:
     v, right, up = frame(view)
     tilt = np.radians([0, 20, 35, 45, 50, 60, 65, 70])
     turn = np.radians([0, 10, 100, 190, 280, 55, 145, 260])
-    return (np.cos(tilt)[:, None] * v + np.sin(tilt)[:, None]
-            * (np.cos(turn)[:, None] * right + np.sin(turn)[:, None] * up))
+    return np.cos(tilt)[:, None] * v + np.sin(tilt)[:, None] * (
+        np.cos(turn)[:, None] * right + np.sin(turn)[:, None] * up
+    )
 
 
 @dataclass(frozen=True)
@@ -162,19 +170,33 @@ def tiles(view: np.ndarray) -> Scene:
     for row, (color, metallic, roughness) in enumerate(MATERIALS):
         positions = []
         for column in range(len(normals)):
-            corners = [(column - n / 2 + dx) * right + (n / 2 - row - dy) * up
-                       for dx, dy in ((0, 0), (0, 1), (1, 1), (1, 0))]
+            corners = [
+                (column - n / 2 + dx) * right + (n / 2 - row - dy) * up for dx, dy in ((0, 0), (0, 1), (1, 1), (1, 0))
+            ]
             positions += corners
             # The pixel that `values` takes is half a pixel right of and below the middle.
             away = eye - (np.mean(corners, 0) + 0.5 / TILE * (right - up))
             views[row, column] = away / np.linalg.norm(away)
         quads = np.arange(len(normals))[:, None] * 4 + np.array([0, 1, 2, 0, 2, 3])
-        meshes.append({"positions": np.ravel(positions).tolist(), "normals": np.repeat(normals, 4, 0).ravel().tolist(),
-                       "indices": quads.ravel().tolist(), "color": color, "metallic": metallic, "roughness": roughness})
-    camera = {"eye": eye.tolist(), "target": [0, 0, 0], "up": up.tolist(), "fov": math.degrees(2 * math.atan(1 / FAR)),
-              "near": 0.9 * FAR * n / 2, "far": 1.1 * FAR * n / 2}
-    return Scene({"size": n * TILE, "camera": camera, "meshes": meshes},
-                 np.broadcast_to(normals, views.shape), views)
+        meshes.append(
+            {
+                "positions": np.ravel(positions).tolist(),
+                "normals": np.repeat(normals, 4, 0).ravel().tolist(),
+                "indices": quads.ravel().tolist(),
+                "color": color,
+                "metallic": metallic,
+                "roughness": roughness,
+            }
+        )
+    camera = {
+        "eye": eye.tolist(),
+        "target": [0, 0, 0],
+        "up": up.tolist(),
+        "fov": math.degrees(2 * math.atan(1 / FAR)),
+        "near": 0.9 * FAR * n / 2,
+        "far": 1.1 * FAR * n / 2,
+    }
+    return Scene({"size": n * TILE, "camera": camera, "meshes": meshes}, np.broadcast_to(normals, views.shape), views)
 
 
 SCENES = [tiles(view) for view in VIEWS]
@@ -193,11 +215,25 @@ def balls() -> Scene:
     for metallic, y in ((1.0, 1.1), (0.0, -1.1)):
         for k, roughness in enumerate(ROUGHNESS):
             centres.append((2.2 * (k - 2), y, 0.0))
-            meshes.append({"positions": (sphere + centres[-1]).ravel().tolist(), "normals": sphere.ravel().tolist(),
-                           "indices": indices, "color": White, "metallic": metallic, "roughness": roughness})
+            meshes.append(
+                {
+                    "positions": (sphere + centres[-1]).ravel().tolist(),
+                    "normals": sphere.ravel().tolist(),
+                    "indices": indices,
+                    "color": White,
+                    "metallic": metallic,
+                    "roughness": roughness,
+                }
+            )
     half, away = 5.6, 300.0
-    camera = {"eye": [0, 0, away], "target": [0, 0, 0], "up": [0, 1, 0],
-              "fov": math.degrees(2 * math.atan(half / away)), "near": away - 5, "far": away + 5}
+    camera = {
+        "eye": [0, 0, away],
+        "target": [0, 0, 0],
+        "up": [0, 1, 0],
+        "fov": math.degrees(2 * math.atan(half / away)),
+        "near": away - 5,
+        "far": away + 5,
+    }
     ray = (np.arange(BALL_SIZE) + 0.5) / BALL_SIZE * 2 - 1
     d = np.stack([*np.meshgrid(ray * half, -ray * half), np.full((BALL_SIZE, BALL_SIZE), -away)], -1)
     d /= np.linalg.norm(d, axis=-1, keepdims=True)
@@ -236,8 +272,16 @@ def bent(engine: Engine, n: np.ndarray, v: np.ndarray, roughness: float) -> np.n
     return d / np.linalg.norm(d, axis=-1, keepdims=True)
 
 
-def shaded(engine: Engine, material: tuple[Sequence[float], float, float], n: np.ndarray, v: np.ndarray, chain: Chain,
-           radiance: Radiance, irradiance: Irradiance, table: Table) -> np.ndarray:
+def shaded(
+    engine: Engine,
+    material: tuple[Sequence[float], float, float],
+    n: np.ndarray,
+    v: np.ndarray,
+    chain: Chain,
+    radiance: Radiance,
+    irradiance: Irradiance,
+    table: Table,
+) -> np.ndarray:
     """(m, 3): what an engine makes of light. Where it reads is the preset's; what it does with it is copied from its
     shaders (lights_physical_pars_fragment of three.js, pbrBlockFinalLitComponents of Babylon.js, surface_light_indirect
     of Filament)."""
@@ -285,9 +329,11 @@ def table_of(engine: Engine, about: Mapping[str, Any]) -> Table:
     """The engine's own table: what the preset says of its axes is held too. Filament does not show its own: exact
     albedos, of a roughness that is one texel of 64 higher, as its table is (coord = (h - y + 0.5)/h in its cmgen)."""
     if engine.name == "filament":
+
         def exact(nov: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
             whole, schlick = reference.ggx_albedo_1d(nov, np.full(nov.shape, min(roughness + 1 / 64, 1.0) ** 2))
             return schlick, whole
+
         return exact
     size = about["dfg"]["size"]
     assert size == engine.dfg.size
@@ -300,6 +346,7 @@ def table_of(engine: Engine, about: Mapping[str, Any]) -> Table:
         at = {"NoV": nov, "roughness": np.full(nov.shape, roughness), "alpha": np.full(nov.shape, roughness**2)}
         found = bilinear_table(values, at[engine.dfg.x], at[engine.dfg.y])
         return found[:, 0], found[:, 1]
+
     return read
 
 
@@ -390,8 +437,12 @@ class Rendered:
 
     def wanted(self, name: str, scene: Scene) -> np.ndarray:
         chain, radiance, irradiance = as_read(self.engine, self.files[name])
-        return np.stack([shaded(self.engine, material, n, v, chain, radiance, irradiance, self.table)
-                         for material, n, v in zip(MATERIALS, scene.normals, scene.views, strict=True)])
+        return np.stack(
+            [
+                shaded(self.engine, material, n, v, chain, radiance, irradiance, self.table)
+                for material, n, v in zip(MATERIALS, scene.normals, scene.views, strict=True)
+            ]
+        )
 
 
 @pytest.fixture(scope="module")
@@ -402,8 +453,23 @@ def baked(tmp_path_factory) -> Path:
     phi, theta = np.meshgrid((np.arange(2 * rows) + 0.5) / rows * np.pi - np.pi, (np.arange(rows) + 0.5) / rows * np.pi)
     d = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)], -1)
     write_exr(folder / "light.exr", light(d).astype(np.float32))
-    done = subprocess.run([sys.executable, "-m", "whitefurnace", "bake", str(folder / "light.exr"), "-o", str(folder),
-                           "--for", ",".join(SNIPPETS), "--size", str(SIZE)], capture_output=True, text=True)
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "whitefurnace",
+            "bake",
+            str(folder / "light.exr"),
+            "-o",
+            str(folder),
+            "--for",
+            ",".join(SNIPPETS),
+            "--size",
+            str(SIZE),
+        ],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr
     return folder
 
@@ -430,8 +496,14 @@ def engine(request, node_modules, baked, tmp_path_factory) -> Rendered:
         for k, scene in enumerate(scenes):
             geometry = folder / f"{file}{k}.glb"
             geometry.write_bytes(glb(scene.job["meshes"]))
-            jobs.append({**scene.job, "name": f"{file}{k}", "environment": f"/files/{files[file].name}",
-                         "glb": f"/files/{geometry.name}"})
+            jobs.append(
+                {
+                    **scene.job,
+                    "name": f"{file}{k}",
+                    "environment": f"/files/{files[file].name}",
+                    "glb": f"/files/{geometry.name}",
+                }
+            )
     answer = rendered(preset.name, jobs, node_modules, folder)
     for name, image in answer.images.items():
         shown = np.clip(image, 0, 1)
@@ -451,7 +523,8 @@ def agree(got: np.ndarray, want: np.ndarray, tolerance: float, what: str) -> Non
     off = np.abs(got - want)
     row, column, channel = np.unravel_index(off.argmax(), off.shape)
     assert off.max() <= tolerance, (
-        f"{what}: {MATERIALS[row]}, normal {column}, channel {channel}: {got[row, column]}, wanted {want[row, column]}")
+        f"{what}: {MATERIALS[row]}, normal {column}, channel {channel}: {got[row, column]}, wanted {want[row, column]}"
+    )
 
 
 def test_the_lod_of_every_roughness_is_the_presets(engine):
@@ -512,8 +585,12 @@ def test_rough_metal_shows_the_lobe_of_its_roughness(engine):
 
     for k, scene in enumerate(SCENES):
         got = scene.values(engine.answer.images[f"light{k}"])[:5, :, 0]
-        want = np.stack([shaded(preset, material, n, v, chain, radiance, irradiance, engine.table)[:, 0]
-                         for material, n, v in zip(MATERIALS[:5], scene.normals, scene.views, strict=False)])
+        want = np.stack(
+            [
+                shaded(preset, material, n, v, chain, radiance, irradiance, engine.table)[:, 0]
+                for material, n, v in zip(MATERIALS[:5], scene.normals, scene.views, strict=False)
+            ]
+        )
         # Bilinear reads cut the tops of Y₆ off: by l(l + 1)/2 · h²/8 each way, h = π/2/16 the coarsest texel of levels
         # that hold some of it, .13 of it: 1.2e-2; and level 0 is the mean over a texel.
         np.testing.assert_allclose(got, want, rtol=0, atol=0.018)
@@ -545,8 +622,9 @@ def test_a_white_surface_shows_the_irradiance(engine, baked):
     chain, radiance, _ = as_read(preset, engine.files["light"])
     for k, scene in enumerate(SCENES):
         got = scene.values(engine.answer.images[f"light{k}"])[-1]
-        want = shaded(preset, MATERIALS[-1], scene.normals[-1], scene.views[-1], chain, radiance, irradiance,
-                      engine.table)
+        want = shaded(
+            preset, MATERIALS[-1], scene.normals[-1], scene.views[-1], chain, radiance, irradiance, engine.table
+        )
         np.testing.assert_allclose(got, want, rtol=0, atol=tolerance)
 
 
@@ -554,8 +632,10 @@ def test_three_takes_blocks_too(node_modules, tmp_path):
     """A DDS of BC6H: DDSLoader makes no cube of it, and the page shows how it becomes one. An eighth of the memory."""
     pytest.importorskip("ispc_texcomp")
     preset = ENGINES["three"]
-    levels = [turned_cube(light(reference.cube_directions(s)) * (1 - k / 10), preset.matrix)
-              for k, s in enumerate((64, 32, 16, 8))]
+    levels = [
+        turned_cube(light(reference.cube_directions(s)) * (1 - k / 10), preset.matrix)
+        for k, s in enumerate((64, 32, 16, 8))
+    ]
     write_texture(tmp_path / "light.dds", encode("bc6hu", levels, cube=True).texture)
     job = {**SCENES[0].job, "name": "light", "environment": "/files/light.dds"}
     answer = rendered("three", [job], node_modules, tmp_path)
@@ -581,13 +661,15 @@ def test_our_renderer_shows_the_same_spheres(engine, baked):
     lights = read_lights(preset, baked / preset.name, "light")
     scene, image = balls(), engine.answer.images["light2"]
     offs = []
-    for (metallic, roughness), n, v in zip(itertools.product((1.0, 0.0), ROUGHNESS), scene.normals, scene.views,
-                                           strict=True):
+    for (metallic, roughness), n, v in zip(
+        itertools.product((1.0, 0.0), ROUGHNESS), scene.normals, scene.views, strict=True
+    ):
         # At the rim a pixel is more than one normal, and a hair of position is a large angle.
         seen = (n * v).sum(-1) > 0.4
         least = WASM_LEAST if preset.name == "filament" else preset.least
-        want = shade(preset, lights, n[seen].T, v[seen].T, White, metallic,
-                     smoothed(preset, max(roughness, least), n)[seen])
+        want = shade(
+            preset, lights, n[seen].T, v[seen].T, White, metallic, smoothed(preset, max(roughness, least), n)[seen]
+        )
         offs.append(np.abs(image[seen] - want).max(-1))
     off = np.concatenate(offs)
     # Tables of engines are up to .022 off (of .04 + Fc), ours 1e-3; the mesh of 96 x 48 quads turns normals by 1e-3, on
@@ -598,8 +680,11 @@ def test_our_renderer_shows_the_same_spheres(engine, baked):
 POINTS = 32
 """A side of the square of random points at which snippets are asked."""
 
-SHOWS = {"radiance": "specular_radiance(n, v, r)", "irradiance": "irradiance(n)",
-         "albedo": "specular_albedo(vec3(0.9, 0.5, 0.1), dot(n, v), r)"}
+SHOWS = {
+    "radiance": "specular_radiance(n, v, r)",
+    "irradiance": "irradiance(n)",
+    "albedo": "specular_albedo(vec3(0.9, 0.5, 0.1), dot(n, v), r)",
+}
 
 
 def test_snippets_read_the_files_on_a_gpu_as_our_renderer_does(node_modules, baked, tmp_path):
@@ -619,27 +704,42 @@ def test_snippets_read_the_files_on_a_gpu_as_our_renderer_does(node_modules, bak
         return {"url": f"/files/{name}", "width": image.shape[-2], "height": image.shape[-3]}
 
     square = (POINTS, POINTS, -1)
-    points = {"normals": [given("normals", np.column_stack([n, r]).reshape(square))],
-              "views": [given("views", v.reshape(square))]}
+    points = {
+        "normals": [given("normals", np.column_stack([n, r]).reshape(square))],
+        "views": [given("views", v.reshape(square))],
+    }
     jobs, wanted = [], {}
     for name in SNIPPETS:
         preset, lights = ENGINES[name], read_lights(ENGINES[name], baked / name, "light")
         shutil.copy(baked / name / "light.glsl", tmp_path / f"{name}.glsl")
         assert lights.dfg is not None
-        textures = points | {"dfg_map": [given(f"{name}-dfg", lights.dfg)],
-                             "specular_map": [given(f"{name}-{k}", level) for k, level in enumerate(lights.levels)]}
+        textures = points | {
+            "dfg_map": [given(f"{name}-dfg", lights.dfg)],
+            "specular_map": [given(f"{name}-{k}", level) for k, level in enumerate(lights.levels)],
+        }
         if lights.irradiance is not None:
             textures["irradiance_map"] = [given(f"{name}-irradiance", lights.irradiance)]
         for what, show in SHOWS.items():
-            jobs.append({"name": f"{name}-{what}", "size": POINTS, "snippet": f"/files/{name}.glsl", "show": show,
-                         "textures": textures, "sh": None if lights.sh is None else np.ravel(lights.sh).tolist()})
+            jobs.append(
+                {
+                    "name": f"{name}-{what}",
+                    "size": POINTS,
+                    "snippet": f"/files/{name}.glsl",
+                    "show": show,
+                    "textures": textures,
+                    "sh": None if lights.sh is None else np.ravel(lights.sh).tolist(),
+                }
+            )
         rough = np.maximum(r, preset.least)
         share = preset.blend_formula(r=rough, alpha=rough**2) * np.ones((len(r), 1)).T
         diffuse = irradiance(preset, lights, n.T)
         lit = specular(preset, lights, n.T, v.T, rough)
         a, b = split_sum(preset, lights.dfg, (n * v).sum(1), rough)
-        wanted |= {f"{name}-radiance": lit + (diffuse - lit) * share.T, f"{name}-irradiance": diffuse,
-                   f"{name}-albedo": a[:, None] * np.array([0.9, 0.5, 0.1]) + b[:, None]}
+        wanted |= {
+            f"{name}-radiance": lit + (diffuse - lit) * share.T,
+            f"{name}-irradiance": diffuse,
+            f"{name}-albedo": a[:, None] * np.array([0.9, 0.5, 0.1]) + b[:, None],
+        }
     images = rendered("snippet", jobs, node_modules, tmp_path).images
     for name, want in wanted.items():
         off = np.abs(images[name].reshape(-1, 3) - want)

@@ -1,5 +1,6 @@
 """Engines as data: mappings, axes and files of every preset and of a user's own, baked, read back and held against
 what the project's own arrays say."""
+
 from __future__ import annotations
 
 import itertools
@@ -46,11 +47,20 @@ TOGETHER = tuple(name for name in LOADED if not ENGINES[name].holding("sheen"))
 # ------------------------------------------------------------------------------------------------- formulas
 
 
-@pytest.mark.parametrize(("text", "value"), [
-    ("max_lod * r * (2 - r)", 4 * 0.75), ("r**2 if r < .25 else .5*r + .375", 0.625), ("-r + 2**3", 7.5),
-    ("clamp(8 * r, 0, 3)", 3.0), ("mix(1, 3, r)", 2.0), ("max(log2(r), -0.25)", -0.25), ("1e-3 / .5", 2e-3),
-    ("exp2(log2(alpha) / 2)", 0.5), ("abs(min(r, 2) - 1) + sqrt(alpha) + pow(r, 2)", 1.25),
-])
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("max_lod * r * (2 - r)", 4 * 0.75),
+        ("r**2 if r < .25 else .5*r + .375", 0.625),
+        ("-r + 2**3", 7.5),
+        ("clamp(8 * r, 0, 3)", 3.0),
+        ("mix(1, 3, r)", 2.0),
+        ("max(log2(r), -0.25)", -0.25),
+        ("1e-3 / .5", 2e-3),
+        ("exp2(log2(alpha) / 2)", 0.5),
+        ("abs(min(r, 2) - 1) + sqrt(alpha) + pow(r, 2)", 1.25),
+    ],
+)
 def test_a_formula_is_what_it_says(text, value):
     formula = Expression(text, LOD_NAMES)
     assert formula(r=0.5, alpha=0.25, max_lod=4, width=128) == pytest.approx(value, abs=1e-12)
@@ -58,15 +68,41 @@ def test_a_formula_is_what_it_says(text, value):
     for language in LANGUAGES:
         written = formula.shader(language, r="roughness")
         # No integer stands alone: WGSL knows no mixed arithmetic.
-        assert "**" not in written and not any(word.isdigit() for word in written.replace("(", " ").replace(
-            ")", " ").replace(",", " ").split())
+        assert "**" not in written and not any(
+            word.isdigit() for word in written.replace("(", " ").replace(")", " ").replace(",", " ").split()
+        )
 
 
-@pytest.mark.parametrize("text", [
-    "__import__('os').system('x')", "r.real", "r[0]", "lambda: r", "rr", "2 **", "True", "r if r else 1", "sqrt(1, 2)",
-    "'a'", "1e999", "(" * 300 + "r" + ")" * 300, "", "r" * 2000, "+".join(["r"] * 300), "[r]", "r < 1", "f(r)", "1j",
-    "r; r", "r\nr", "x := r", "max(*r, 1)", "max(r, b=1)", "1" + "0" * 400,
-])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('x')",
+        "r.real",
+        "r[0]",
+        "lambda: r",
+        "rr",
+        "2 **",
+        "True",
+        "r if r else 1",
+        "sqrt(1, 2)",
+        "'a'",
+        "1e999",
+        "(" * 300 + "r" + ")" * 300,
+        "",
+        "r" * 2000,
+        "+".join(["r"] * 300),
+        "[r]",
+        "r < 1",
+        "f(r)",
+        "1j",
+        "r; r",
+        "r\nr",
+        "x := r",
+        "max(*r, 1)",
+        "max(r, b=1)",
+        "1" + "0" * 400,
+    ],
+)
 def test_what_is_no_formula_is_one_sentence(text):
     with pytest.raises(UsageError) as told:
         Expression(text, ("r",), "here: lod")
@@ -83,6 +119,7 @@ def test_a_table_is_piecewise_linear():
 
 # ------------------------------------------------------------------------------------------------- mappings
 
+
 @pytest.mark.parametrize("name", LOADED)
 def test_mappings_are_those_of_the_engines(name):
     published, engine = PRESETS[name].published, ENGINES[name]
@@ -91,20 +128,26 @@ def test_mappings_are_those_of_the_engines(name):
     assert engine.bend_formula(r=0.5, alpha=0.25) == pytest.approx(published.bend, abs=1e-12)
     assert engine.blend_formula(r=0.5, alpha=0.25) == pytest.approx(published.blend, abs=1e-12)
     assert [tuple(row) for row in engine.matrix] == [
-        tuple(math.copysign(1, a) if k == abs(a) - 1 else 0 for k in range(3)) for a in published.direction]
+        tuple(math.copysign(1, a) if k == abs(a) - 1 else 0 for k in range(3)) for a in published.direction
+    ]
 
 
 @pytest.mark.parametrize("name", LOADED)
 def test_levels_hold_what_is_read_there(name):
     engine = ENGINES[name]
-    recipe = chain(size=engine.size, lods=engine.lods, usual_min=engine.min_size,
-                   **({"levels": engine.levels} if engine.levels else {}))
+    recipe = chain(
+        size=engine.size,
+        lods=engine.lods,
+        usual_min=engine.min_size,
+        **({"levels": engine.levels} if engine.levels else {}),
+    )
     assert recipe.levels[0] == (engine.size, 0.0) and recipe.levels[-1][1] >= 1
     for k, (_, r) in enumerate(recipe.levels[1:], 1):
         if r != 1 or recipe.lod(1) >= k:
             # 12 digits of r, where lod(r) is as flat as Filament's at 1, are 6 of lod.
-            assert engine.lods.lod is None or float(engine.lods.lod(
-                r=r, alpha=r * r, max_lod=len(recipe.levels) - 1, width=engine.size)) == pytest.approx(k, abs=1e-5)
+            assert engine.lods.lod is None or float(
+                engine.lods.lod(r=r, alpha=r * r, max_lod=len(recipe.levels) - 1, width=engine.size)
+            ) == pytest.approx(k, abs=1e-5)
             assert recipe.lod(min(r, 1.0)) <= k + 1e-5
     assert [r for _, r in recipe.levels] == sorted(r for _, r in recipe.levels)
 
@@ -112,8 +155,9 @@ def test_levels_hold_what_is_read_there(name):
 def test_levels_past_one():
     followed = chain(size=128, usual_min=1, lods=ENGINES["babylon"].lods)
     # lod = .8 log2(width (α + 5e-4)) [Babylon.js pbrBlockReflection, MINIMUMVARIANCE].
-    assert [r * r for _, r in followed.levels[1:]] == pytest.approx([2 ** (k / 0.8) / 128 - 5e-4 for k in range(1, 8)],
-                                                                    rel=1e-9)
+    assert [r * r for _, r in followed.levels[1:]] == pytest.approx(
+        [2 ** (k / 0.8) / 128 - 5e-4 for k in range(1, 8)], rel=1e-9
+    )
     assert followed.parameters(1.5) == {"alpha": 2.25}
     stopped = chain(size=128, usual_min=1, lods=ENGINES["unreal"].lods)
     assert [r for _, r in stopped.levels][-3:] == [1, 1, 1]
@@ -129,6 +173,7 @@ def test_a_mapping_that_does_not_grow_is_refused(text):
 
 def test_fit_follows_the_mapping_of_the_engine(device):
     from whitefurnace.prefiltering.level_fit import read_mixtures
+
     linear = chain(fit="read", lods=ENGINES["bevy"].lods)
     mixtures = read_mixtures(device, linear)
     assert mixtures[0] is None and all(sum(w for w, _ in m) == pytest.approx(1) for m in mixtures[1:])
@@ -142,9 +187,14 @@ def test_fit_follows_the_mapping_of_the_engine(device):
 # ------------------------------------------------------------------------------------------------- axes
 
 
-@pytest.mark.parametrize("words", [
-    " ".join(a + b for a, b in zip(signs, axes, strict=True))
-    for axes in itertools.permutations("xyz") for signs in itertools.product("+-", repeat=3)])
+@pytest.mark.parametrize(
+    "words",
+    [
+        " ".join(a + b for a, b in zip(signs, axes, strict=True))
+        for axes in itertools.permutations("xyz")
+        for signs in itertools.product("+-", repeat=3)
+    ],
+)
 def test_a_turned_cube_is_read_in_the_engines_direction(words):
     d = cube_directions(5)
     matrix = np.array(axes_matrix(words))
@@ -241,7 +291,7 @@ def test_harmonics_of_engines_are_theirs(baked):
     with np.load(folder / "raw" / "array.npz") as archive:
         sh = archive["sh"]
     lines = (folder / "filament" / "array_sh.txt").read_text().splitlines()
-    rows = np.array([[float(x) for x in line[line.index("(") + 1:line.index(")")].split(",")] for line in lines])
+    rows = np.array([[float(x) for x in line[line.index("(") + 1 : line.index(")")].split(",")] for line in lines])
     assert np.abs(rows - harmonic.filament(sh)).max() < 1e-14
     assert lines[0].endswith("// L00, irradiance, pre-scaled base")
     words = read_texture(folder / "filament" / "array_ibl.ktx").key_values["sh"].rstrip(b"\0").split()
@@ -312,8 +362,17 @@ def test_files_are_no_larger_than_they_need_be(tmp_path, device):
 # ------------------------------------------------------------------------------------------------- tables
 
 
-@pytest.mark.parametrize("name", [n for n in LOADED if ENGINES[n].holding("dfg") and ENGINES[n].dfg.x != "alpha" and
-                                  ENGINES[n].dfg.y != "alpha" and ENGINES[n].dfg.NoV == "centres"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        n
+        for n in LOADED
+        if ENGINES[n].holding("dfg")
+        and ENGINES[n].dfg.x != "alpha"
+        and ENGINES[n].dfg.y != "alpha"
+        and ENGINES[n].dfg.NoV == "centres"
+    ],
+)
 def test_tables_of_engines(name, device):
     engine = ENGINES[name]
     made = split_sum(engine.dfg, device=device)
@@ -390,8 +449,14 @@ def test_a_users_engine(tmp_path, device):
     path.write_text(MINE)
     (made,) = bake(coded(), tmp_path / "out", for_=f"raw,{path}", device=device)
     folder = tmp_path / "out" / "mine"
-    assert {p.name for p in folder.iterdir()} == {"array_spec.ktx2", "array.json", "array_dfg.exr", "array.glsl",
-                                                  "array.hlsl", "array.wgsl"}
+    assert {p.name for p in folder.iterdir()} == {
+        "array_spec.ktx2",
+        "array.json",
+        "array_dfg.exr",
+        "array.glsl",
+        "array.hlsl",
+        "array.wgsl",
+    }
     texture = read_texture(folder / "array_spec.ktx2")
     assert texture.format == "rgba32f" and len(texture.levels) == 3
     assert [row["roughness"] for row in made.levels if "mine" in row["for"]] == pytest.approx([0, 0.5, 1])
@@ -406,19 +471,30 @@ def test_a_users_engine(tmp_path, device):
     assert bake(coded(), tmp_path / "out", for_=f"raw,{path}", device=device)[0].state == "done", "another engine"
 
 
-@pytest.mark.parametrize(("change", "told"), [
-    (("title", "titel"), "did you mean 'title'"), (("holds = \"sh\"", "holds = \"sg\""), "holds"),
-    (("lod = [[0, 0], [0.5, 1], [1, 2]]", "lod = 'max_lod * q'"), "'q'"), (("+x +z -y", "+x +z"), "axes"),
-    (("rgba32f", "rgb9e6"), "rgb9e5"), (("zstd = 3", "zstd = 99"), "zstd"),
-    (("{stem}_spec.ktx2", "../spec.ktx2"), "{stem}"),
-    (("{stem}_spec.ktx2", "{stem}/../x.ktx2"), "{stem}"), (("size = 16", "size = 0"), "dfg.size"),
-    (("{stem}.json", "{stem}_spec.ktx2"), "twice"), (("_dfg.exr", "_dfg.ktx"), ".ktx"),
-    (("NoV = \"sqrt\"", "x = \"r\""), "x"),
-    (("bend = \"alpha\"", "bend = \"alpha * \""), "bend"), (("sh = \"irradiance\"", ""), "sh"),
-    (("[dfg]", "[dfg"), "TOML"), (("title = \"Mine\"", "proven = true"), "proven"),
-    (("size = 32", "size = '32'"), "size"),
-    (("size = 32", "size = 33"), "power of two"), (("[0.5, 1]", "[1.5, 1]"), "grow"),
-])
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("title", "titel"), "did you mean 'title'"),
+        (('holds = "sh"', 'holds = "sg"'), "holds"),
+        (("lod = [[0, 0], [0.5, 1], [1, 2]]", "lod = 'max_lod * q'"), "'q'"),
+        (("+x +z -y", "+x +z"), "axes"),
+        (("rgba32f", "rgb9e6"), "rgb9e5"),
+        (("zstd = 3", "zstd = 99"), "zstd"),
+        (("{stem}_spec.ktx2", "../spec.ktx2"), "{stem}"),
+        (("{stem}_spec.ktx2", "{stem}/../x.ktx2"), "{stem}"),
+        (("size = 16", "size = 0"), "dfg.size"),
+        (("{stem}.json", "{stem}_spec.ktx2"), "twice"),
+        (("_dfg.exr", "_dfg.ktx"), ".ktx"),
+        (('NoV = "sqrt"', 'x = "r"'), "x"),
+        (('bend = "alpha"', 'bend = "alpha * "'), "bend"),
+        (('sh = "irradiance"', ""), "sh"),
+        (("[dfg]", "[dfg"), "TOML"),
+        (('title = "Mine"', "proven = true"), "proven"),
+        (("size = 32", "size = '32'"), "size"),
+        (("size = 32", "size = 33"), "power of two"),
+        (("[0.5, 1]", "[1.5, 1]"), "grow"),
+    ],
+)
 def test_a_users_engine_that_is_wrong_is_one_sentence(tmp_path, change, told):
     path = tmp_path / "mine.toml"
     assert change[0] in MINE
@@ -478,7 +554,7 @@ def test_octahedral_maps(tmp_path, device):
     for k, (row, place) in enumerate(zip(rows, places, strict=True)):
         s, b = place["size"], 2
         assert row["size"] == s and row["error"] <= (1e-3 if k else 2e-2)  # level 0 is of points
-        image = atlas[place["row"] - b:place["row"] + s + b, place["column"] - b:place["column"] + s + b]
+        image = atlas[place["row"] - b : place["row"] + s + b, place["column"] - b : place["column"] + s + b]
         np.testing.assert_array_equal(octamap.strip_border(image, b), decode(texture, k)[..., :3])
         read = octamap.read_bilinear(image, d, b)
         c = float(((2 * read - 1) * d.T).sum(1).mean())

@@ -3,6 +3,7 @@
 The texts themselves are executed: with a small header GLSL, HLSL and WGSL are OpenCL C, textures give back where they
 were read, and the results are held against numbers written here by hand from what is known of each engine.
 """
+
 from __future__ import annotations
 
 import re
@@ -20,21 +21,38 @@ from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere import octahedral_map as octamap
 
 OWN = Engine(
-    name="own", lod=((0, 0), (0.25, 2), (1, 3)), axes="+z -x +y", bend="r / 4", blend="0.25 * alpha", least=0.1,
-    sh="radiance", dfg=Dfg(32, x="alpha", y="NoV", NoV="sqrt"),
-    file=(File("specular", "{stem}.ktx2", "rgba16f"), File("sh", "{stem}.json"),
-          File("dfg", "{stem}_dfg.ktx2", "rg16f")))
+    name="own",
+    lod=((0, 0), (0.25, 2), (1, 3)),
+    axes="+z -x +y",
+    bend="r / 4",
+    blend="0.25 * alpha",
+    least=0.1,
+    sh="radiance",
+    dfg=Dfg(32, x="alpha", y="NoV", NoV="sqrt"),
+    file=(
+        File("specular", "{stem}.ktx2", "rgba16f"),
+        File("sh", "{stem}.json"),
+        File("dfg", "{stem}_dfg.ktx2", "rg16f"),
+    ),
+)
 MAPS = Engine(
-    name="maps", lod="max_lod * r",
-    file=(File("specular", "{stem}.ktx2", "rgba16f", layout="octahedral", border=0),
-          File("irradiance", "{stem}_i.ktx2", "rgba16f")))
+    name="maps",
+    lod="max_lod * r",
+    file=(
+        File("specular", "{stem}.ktx2", "rgba16f", layout="octahedral", border=0),
+        File("irradiance", "{stem}_i.ktx2", "rgba16f"),
+    ),
+)
 ATLAS = Engine(name="atlas", lod="max_lod * r", file=(File("specular", "{stem}.exr", layout="octahedral", border=2),))
 EDGES = Engine(name="edges", lod="max_lod * r", file=(File("specular", "{stem}.exr", layout="octahedral", border=0),))
 BAKED = [*(engine for engine in ENGINES.values() if engine.holding("specular")), OWN, MAPS, ATLAS, EDGES]
 
 PUBLISHED = {name: preset.published for name, preset in PRESETS.items() if preset.published is not None} | {
     "own": Published(4, 64, 2 + 1 / 3, 1 / 8, 0.25 * 0.25, (3, -1, 2), (0.25, (0.3**0.5 * 31 + 0.5) / 32)),
-    "maps": Published(4, 64, 1.5), "atlas": Published(4, 64, 1.5), "edges": Published(4, 64, 1.5)}
+    "maps": Published(4, 64, 1.5),
+    "atlas": Published(4, 64, 1.5),
+    "edges": Published(4, 64, 1.5),
+}
 """What each engine computes at r = 1/2, from what is published of it."""
 
 
@@ -46,15 +64,24 @@ def text_of(engine: Engine, language: str) -> str:
 # ------------------------------------------------------------------------------------------------- compilers
 
 CALLS = {
-    "glsl": ("#version 300 es\nprecision highp float;\nprecision highp samplerCube;\nprecision highp sampler2D;\n",
-             "\nin vec3 a;\nout vec4 color;\nvoid main() {{\nvec3 x = specular_radiance(a, a, .5) + irradiance(a);\n"
-             "{albedo}color = vec4(x, 1.0); }}\n", "x += specular_albedo(a, .5, .5);\n"),
-    "hlsl": ("", "\nfloat4 main(float3 a : TEXCOORD0) : SV_Target {{\n"
-             "float3 x = specular_radiance(a, a, .5) + irradiance(a);\n{albedo}return float4(x, 1.0); }}\n",
-             "x += specular_albedo(a, .5, .5);\n"),
-    "wgsl": ("", "\n@fragment fn main(@location(0) a: vec3f) -> @location(0) vec4f {{\n"
-             "var x = specular_radiance(a, a, .5) + irradiance(a);\n{albedo}return vec4f(x, 1.0); }}\n",
-             "x += specular_albedo(a, .5, .5);\n"),
+    "glsl": (
+        "#version 300 es\nprecision highp float;\nprecision highp samplerCube;\nprecision highp sampler2D;\n",
+        "\nin vec3 a;\nout vec4 color;\nvoid main() {{\nvec3 x = specular_radiance(a, a, .5) + irradiance(a);\n"
+        "{albedo}color = vec4(x, 1.0); }}\n",
+        "x += specular_albedo(a, .5, .5);\n",
+    ),
+    "hlsl": (
+        "",
+        "\nfloat4 main(float3 a : TEXCOORD0) : SV_Target {{\n"
+        "float3 x = specular_radiance(a, a, .5) + irradiance(a);\n{albedo}return float4(x, 1.0); }}\n",
+        "x += specular_albedo(a, .5, .5);\n",
+    ),
+    "wgsl": (
+        "",
+        "\n@fragment fn main(@location(0) a: vec3f) -> @location(0) vec4f {{\n"
+        "var x = specular_radiance(a, a, .5) + irradiance(a);\n{albedo}return vec4f(x, 1.0); }}\n",
+        "x += specular_albedo(a, .5, .5);\n",
+    ),
 }
 COMPILERS = {
     "glslangValidator": ("glsl", ".frag", ["-S", "frag"]),
@@ -105,18 +132,30 @@ float4 __attribute__((overloadable)) textureLod(int texture, float2 at, float lo
 enum { specular_map = 1, irradiance_map = 2, sheen_map = 3, dfg_map = 4 };
 """
 
+
 def as_opencl(text: str, language: str, sh: np.ndarray | None, ending: str) -> str:
     """The snippet as OpenCL C: the spelling of declarations and of reads, and the names; nothing that computes."""
     text = re.sub(r"//[^\n]*", "", text)
     rows = "" if sh is None else ", ".join(f"(float3)({x!r}, {y!r}, {z!r})" for x, y, z in sh.astype(float).tolist())
-    text = re.sub(r"^(uniform \w+ sh\[9\]|(@group\(0\) @binding\(\d+\) )?var<uniform> sh: array<vec3f, 9>);",
-                  "__constant float3 sh[9] = {" + rows + "};", text, flags=re.M)
+    text = re.sub(
+        r"^(uniform \w+ sh\[9\]|(@group\(0\) @binding\(\d+\) )?var<uniform> sh: array<vec3f, 9>);",
+        "__constant float3 sh[9] = {" + rows + "};",
+        text,
+        flags=re.M,
+    )
     text = re.sub(r"^(uniform sampler\w+ \w+|Texture\w+ \w+|SamplerState \w+|@group[^;]*);", "", text, flags=re.M)
     text = re.sub(r"(\w+)\.SampleLevel\(linear_clamp, ", r"textureLod(\1, ", text)
     text = re.sub(r"textureSampleLevel\((\w+), linear_clamp, ", r"textureLod(\1, ", text)
     if language == "wgsl":
-        text = re.sub(r"fn (\w+)\(([^)]*)\) -> (\w+) \{", lambda m: f"{m[3]} {m[1]}(" + ", ".join(
-            "{1} {0}".format(*(word.strip() for word in one.split(":"))) for one in m[2].split(",")) + ") {", text)
+        text = re.sub(
+            r"fn (\w+)\(([^)]*)\) -> (\w+) \{",
+            lambda m: (
+                f"{m[3]} {m[1]}("
+                + ", ".join("{1} {0}".format(*(word.strip() for word in one.split(":"))) for one in m[2].split(","))
+                + ") {"
+            ),
+            text,
+        )
         kinds = {"alpha": "float", "k": "float", "side": "float", "d": "float3", "a": "float3", "e": "float2"}
         table = re.search(r"^(\w+) dfg\(", text, re.M)
         kinds["t"] = table[1] if table else "float2"
@@ -160,17 +199,23 @@ def executed(device) -> dict[tuple[str, str, float], np.ndarray]:
                 coefficients = harmonic.coefficients_of(C, B, Q).T
                 sh = harmonic.SCALINGS[engine.sh](harmonic.turned(coefficients, engine.matrix))
             texts.append(as_opencl(text_of(engine, language), language, sh, ending))
-            table = (f"vstore2(dfg{ending}(NoV, r).xy, 0, out + 13); "
-                     f"vstore3(specular_albedo{ending}((float3)(.1f, .5f, 1.0f), NoV, r), 0, out + 15);")
+            table = (
+                f"vstore2(dfg{ending}(NoV, r).xy, 0, out + 13); "
+                f"vstore3(specular_albedo{ending}((float3)(.1f, .5f, 1.0f), NoV, r), 0, out + 15);"
+            )
             sheen = f"vstore3(sheen_radiance{ending}(n, v, r), 0, out + 18);"
-            calls.append(f"case {k}: out[0] = specular_lod{ending}(r); vstore3(irradiance{ending}(n), 0, out + 7); "
-                         f"vstore3(specular_direction{ending}(n, v, r), 0, out + 1); "
-                         f"vstore3(stored_direction{ending}(n), 0, out + 4); "
-                         f"vstore3(specular_radiance{ending}(n, v, r), 0, out + 10); "
-                         f"{table if engine.holding('dfg') else ''}{sheen if engine.holding('sheen') else ''} break;")
-    kernel = ("kernel void run(global const float *in, float r, global float *out)\n{\n"
-              "float3 n = vload3(0, in), v = vload3(1, in); float NoV = in[6];\n"
-              "out += 24 * get_global_id(0);\nswitch (get_global_id(0)) {\n" + "\n".join(calls) + "\n}\n}\n")
+            calls.append(
+                f"case {k}: out[0] = specular_lod{ending}(r); vstore3(irradiance{ending}(n), 0, out + 7); "
+                f"vstore3(specular_direction{ending}(n, v, r), 0, out + 1); "
+                f"vstore3(stored_direction{ending}(n), 0, out + 4); "
+                f"vstore3(specular_radiance{ending}(n, v, r), 0, out + 10); "
+                f"{table if engine.holding('dfg') else ''}{sheen if engine.holding('sheen') else ''} break;"
+            )
+    kernel = (
+        "kernel void run(global const float *in, float r, global float *out)\n{\n"
+        "float3 n = vload3(0, in), v = vload3(1, in); float NoV = in[6];\n"
+        "out += 24 * get_global_id(0);\nswitch (get_global_id(0)) {\n" + "\n".join(calls) + "\n}\n}\n"
+    )
     program = device.build(HEADER + "\n".join(texts) + kernel)
     given, found = device.array(np.array([*N, *V, NOV], np.float32)), {}
     for r in (0.5, 0.01):
@@ -280,7 +325,10 @@ def test_what_has_no_snippet_is_refused():
 
 def test_rgbd_is_decoded_as_babylon_does():
     # (rgb code)^2.2 / alpha, as helperFunctions' fromRGBD; only presets with such files have it
-    for language, power in (("glsl", "vec3(2.2, 2.2, 2.2)"), ("hlsl", "float3(2.2, 2.2, 2.2)"),
-                            ("wgsl", "vec3f(2.2, 2.2, 2.2)")):
+    for language, power in (
+        ("glsl", "vec3(2.2, 2.2, 2.2)"),
+        ("hlsl", "float3(2.2, 2.2, 2.2)"),
+        ("wgsl", "vec3f(2.2, 2.2, 2.2)"),
+    ):
         assert f"return pow(code.rgb, {power}) / code.a;" in text_of(ENGINES["babylon"], language)
         assert "decode_rgbd" not in text_of(ENGINES["three"], language)

@@ -51,8 +51,15 @@ def made(form: str, shape: str = "cube", seed: int = 1, **options) -> Texture:
     width, height, layers, faces, levels = SHAPES[shape]
     data = random.Random(seed)
     images = max(layers, 1) * faces
-    return Texture(form, width, height, tuple(data.randbytes(level_bytes(form, width, height, k) * images)
-                                              for k in range(levels)), layers, faces, **options)
+    return Texture(
+        form,
+        width,
+        height,
+        tuple(data.randbytes(level_bytes(form, width, height, k) * images) for k in range(levels)),
+        layers,
+        faces,
+        **options,
+    )
 
 
 def same(a: Texture, b: Texture) -> None:
@@ -96,11 +103,21 @@ def test_levels_decode_to_the_values_that_were_given():
 
 
 def test_a_texture_that_is_none_is_a_mistake_of_the_caller():
-    for options in (dict(width=0), dict(width=3), dict(faces=2), dict(layers=-1), dict(levels=()), dict(height=3),
-                    dict(levels=(bytes(48), bytes(12), bytes(3), bytes(3))), dict(levels=(bytes(47),))):
+    for options in (
+        dict(width=0),
+        dict(width=3),
+        dict(faces=2),
+        dict(layers=-1),
+        dict(levels=()),
+        dict(height=3),
+        dict(levels=(bytes(48), bytes(12), bytes(3), bytes(3))),
+        dict(levels=(bytes(47),)),
+    ):
         with pytest.raises(ValueError, match=r"texture|level"):
-            Texture(**{"format": "b10g11r11", "width": 2, "height": 2, "levels": (bytes(96), bytes(24)), "faces": 6}
-                    | options)
+            Texture(
+                **{"format": "b10g11r11", "width": 2, "height": 2, "levels": (bytes(96), bytes(24)), "faces": 6}
+                | options
+            )
     for key in ("", "a\0b"):
         with pytest.raises(ValueError, match="no key"):
             ktx2.ktx2_bytes(made("rgb9e5", key_values={key: b""}))
@@ -167,7 +184,7 @@ def test_ktx1_as_filament_reads_it_byte_for_byte():
         + words(2, 2, 0, 0, 6, 2)  # width, height, depth, no array, faces, levels
         + words(44)  # bytesOfKeyValueData: 4 + 23 + 1 of padding, 4 + 7 + 1 of padding, and so on
     )
-    keys = (words(23) + b"KTXorientation\0S=r,T=d\0" + b"\0" + words(7) + b"sh\0" + b"1 2\0" + b"\0")
+    keys = words(23) + b"KTXorientation\0S=r,T=d\0" + b"\0" + words(7) + b"sh\0" + b"1 2\0" + b"\0"
     wanted = wanted[:-4] + words(len(keys)) + keys
     wanted += words(16) + b"".join(faces)  # imageSize of a cube that is no array is one face's [KTX 1.1, imageSize]
     wanted += words(4) + b"".join(small)
@@ -190,13 +207,42 @@ def test_ktx1_pads_rows_to_4_bytes_and_takes_gls_own_type():
 ONE, MINUS_ONE = 0x3F800000, 0xBF800000
 DESCRIPTORS = {
     "rg16f": (0x010101, 0, 4, [(0xC00F0000, 0, MINUS_ONE, ONE), (0xC10F0010, 0, MINUS_ONE, ONE)]),
-    "rgba16f": (0x010101, 0, 8, [(0xC00F0000, 0, MINUS_ONE, ONE), (0xC10F0010, 0, MINUS_ONE, ONE),
-                                 (0xC20F0020, 0, MINUS_ONE, ONE), (0xCF0F0030, 0, MINUS_ONE, ONE)]),
-    "rgba32f": (0x010101, 0, 16, [(0xC01F0000, 0, MINUS_ONE, ONE), (0xC11F0020, 0, MINUS_ONE, ONE),
-                                  (0xC21F0040, 0, MINUS_ONE, ONE), (0xCF1F0060, 0, MINUS_ONE, ONE)]),
+    "rgba16f": (
+        0x010101,
+        0,
+        8,
+        [
+            (0xC00F0000, 0, MINUS_ONE, ONE),
+            (0xC10F0010, 0, MINUS_ONE, ONE),
+            (0xC20F0020, 0, MINUS_ONE, ONE),
+            (0xCF0F0030, 0, MINUS_ONE, ONE),
+        ],
+    ),
+    "rgba32f": (
+        0x010101,
+        0,
+        16,
+        [
+            (0xC01F0000, 0, MINUS_ONE, ONE),
+            (0xC11F0020, 0, MINUS_ONE, ONE),
+            (0xC21F0040, 0, MINUS_ONE, ONE),
+            (0xCF1F0060, 0, MINUS_ONE, ONE),
+        ],
+    ),
     "b10g11r11": (0x010101, 0, 4, [(0x800A0000, 0, 0, ONE), (0x810A000B, 0, 0, ONE), (0x82090016, 0, 0, ONE)]),
-    "rgb9e5": (0x010101, 0, 4, [(0x00080000, 0, 0, 8448), (0x2004001B, 0, 15, 31), (0x01080009, 0, 0, 8448),
-                                (0x2104001B, 0, 15, 31), (0x02080012, 0, 0, 8448), (0x2204001B, 0, 15, 31)]),
+    "rgb9e5": (
+        0x010101,
+        0,
+        4,
+        [
+            (0x00080000, 0, 0, 8448),
+            (0x2004001B, 0, 15, 31),
+            (0x01080009, 0, 0, 8448),
+            (0x2104001B, 0, 15, 31),
+            (0x02080012, 0, 0, 8448),
+            (0x2204001B, 0, 15, 31),
+        ],
+    ),
     "bc6hu": (0x010185, 0x0303, 16, [(0x807F0000, 0, 0, ONE)]),
     "bc6hs": (0x010185, 0x0303, 16, [(0xC07F0000, 0, MINUS_ONE, ONE)]),
     "astc4x4hdr": (0x0101A2, 0x0303, 16, [(0xC07F0000, 0, MINUS_ONE, ONE)]),
@@ -216,8 +262,17 @@ def test_ktx2_byte_for_byte():
     texture = Texture("rgba16f", 2, 2, (large, small), 0, 6, {"Z": b"\x01"})
     descriptor = ktx2.data_format_descriptor("rgba16f")  # tested above
     # [KTX 2.0, 3.11]: sorted by code points, each padded to 4
-    keys = (words(18) + b"KTXorientation\0rd\0" + b"\0\0" + words(23) + b"KTXwriter\0whitefurnace\0" + b"\0"
-            + words(3) + b"Z\0\x01" + b"\0")
+    keys = (
+        words(18)
+        + b"KTXorientation\0rd\0"
+        + b"\0\0"
+        + words(23)
+        + b"KTXwriter\0whitefurnace\0"
+        + b"\0"
+        + words(3)
+        + b"Z\0\x01"
+        + b"\0"
+    )
     index = 80 + 2 * 24
     start = index + len(descriptor) + len(keys)
     start += -start % 8  # lcm(8 bytes a texel, 4) [KTX 2.0, 3.13.2]
@@ -225,7 +280,8 @@ def test_ktx2_byte_for_byte():
         bytes.fromhex("AB 4B 54 58 20 32 30 BB 0D 0A 1A 0A")  # [KTX 2.0, 3.1]
         + words(97, 2)  # VK_FORMAT_R16G16B16A16_SFLOAT, typeSize
         + words(2, 2, 0, 0, 6, 2, 0)  # width, height, depth, layers, faces, levels, no supercompression
-        + words(index, len(descriptor), index + len(descriptor), len(keys)) + struct.pack("<2Q", 0, 0)
+        + words(index, len(descriptor), index + len(descriptor), len(keys))
+        + struct.pack("<2Q", 0, 0)
         # the index from the largest on, the data from the smallest on [KTX 2.0, 3.9.7 and 3.13]
         + struct.pack("<6Q", start + 48, 192, 192, start, 48, 48)
     )
@@ -275,10 +331,14 @@ def test_dds_byte_for_byte():
     large, small = [bytes([f] * 32) for f in range(6)], [bytes([64 + f] * 8) for f in range(6)]
     texture = Texture("rgba16f", 2, 2, (b"".join(large), b"".join(small)), 0, 6)
     wanted = (
-        b"DDS " + words(124)
+        b"DDS "
+        + words(124)
         + words(0x1 | 0x2 | 0x4 | 0x8 | 0x1000 | 0x20000)  # CAPS HEIGHT WIDTH PITCH PIXELFORMAT MIPMAPCOUNT
-        + words(2, 2, 16, 0, 2) + bytes(44)  # height, width, pitch, depth, levels, reserved
-        + words(32, 0x4) + b"DX10" + bytes(20)
+        + words(2, 2, 16, 0, 2)
+        + bytes(44)  # height, width, pitch, depth, levels, reserved
+        + words(32, 0x4)
+        + b"DX10"
+        + bytes(20)
         + words(0x8 | 0x1000 | 0x400000, 0x200 | 0xFC00, 0, 0, 0)  # COMPLEX TEXTURE MIPMAP, CUBEMAP with six faces
         + words(10, 3, 0x4, 1, 0)  # DXGI_FORMAT_R16G16B16A16_FLOAT, TEXTURE2D, TEXTURECUBE, one cube
         + b"".join(a + b for a, b in zip(large, small, strict=True))  # face by face, each with its levels
@@ -356,8 +416,13 @@ def test_bc6h_is_encoded_by_ispc_texcomp():
     # A block's colours lie on a line, or two: of this plane of them, 0.3 of 1 wide and 0.3 of 2 or more high, a line
     # along the one can leave half of the other, 7.5 %.
     np.testing.assert_allclose(decode(made.texture, 0), ramp, rtol=0.075)
-    for value, read, clipped, negative in ((65504, 65504, 0, 0), (1e9, 65504, 18, 0), (-2, 0, 0, 18), (0.5, 0.5, 0, 0),
-                                           (np.inf, 65504, 18, 0)):
+    for value, read, clipped, negative in (
+        (65504, 65504, 0, 0),
+        (1e9, 65504, 18, 0),
+        (-2, 0, 0, 18),
+        (0.5, 0.5, 0, 0),
+        (np.inf, 65504, 18, 0),
+    ):
         flat = encode("bc6hu", [np.full((6, 1, 1, 3), value)], cube=True)
         assert (flat.clipped, flat.negative) == ((clipped,), (negative,))
         assert (decode(flat.texture, 0) == read).all(), f"{value} is read as {decode(flat.texture, 0).ravel()[0]}"
@@ -384,8 +449,19 @@ def node_modules(tmp_path_factory) -> Path:
     if shutil.which("npm") is None:
         pytest.skip("npm is not installed, KTX files were not opened by other readers")
     folder = tmp_path_factory.mktemp("node")
-    command = ["npm", "install", "--ignore-scripts", "--no-audit", "--no-fund", "--fetch-retries=1", "--prefix",
-               str(folder), "ktx-parse@2.0.0", "@khronosgroup/gltf-viewer@1.1.0", "filament@1.53.4"]
+    command = [
+        "npm",
+        "install",
+        "--ignore-scripts",
+        "--no-audit",
+        "--no-fund",
+        "--fetch-retries=1",
+        "--prefix",
+        str(folder),
+        "ktx-parse@2.0.0",
+        "@khronosgroup/gltf-viewer@1.1.0",
+        "filament@1.53.4",
+    ]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=120)
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -397,8 +473,9 @@ def node_modules(tmp_path_factory) -> Path:
 
 def others(node_modules: Path, files: list[Path]) -> dict[tuple[str, str], dict]:
     script = Path(__file__).with_name("ktx_readers.mjs")
-    done = subprocess.run(["node", str(script), str(node_modules), *map(str, files)], capture_output=True, text=True,
-                          timeout=120)
+    done = subprocess.run(
+        ["node", str(script), str(node_modules), *map(str, files)], capture_output=True, text=True, timeout=120
+    )
     assert done.returncode == 0, done.stderr
     answers = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     return {(Path(answer["file"]).name, answer["reader"]): answer for answer in answers}
@@ -409,11 +486,28 @@ def digest(data) -> str:
 
 
 # internal format, format and type that WebGL 2 takes for each [OpenGL ES 3.0, table 3.2; WEBGL extensions of blocks]
-GL = {"rg16f": (0x822F, 0x8227, 0x140B), "rgb16f": (0x881B, 0x1907, 0x140B), "rgba16f": (0x881A, 0x1908, 0x140B),
-      "rgba32f": (0x8814, 0x1908, 0x1406), "rgb9e5": (0x8C3D, 0x1907, 0x8C3E), "b10g11r11": (0x8C3A, 0x1907, 0x8C3B),
-      "bc6hu": (0x8E8F, 0, 0), "bc6hs": (0x8E8E, 0, 0), "astc4x4hdr": (0x93B0, 0, 0)}
-VK = {"rg16f": 83, "rgb16f": 90, "rgba16f": 97, "rgba32f": 109, "b10g11r11": 122, "rgb9e5": 123, "bc6hu": 143,
-      "bc6hs": 144, "astc4x4hdr": 1000066000}
+GL = {
+    "rg16f": (0x822F, 0x8227, 0x140B),
+    "rgb16f": (0x881B, 0x1907, 0x140B),
+    "rgba16f": (0x881A, 0x1908, 0x140B),
+    "rgba32f": (0x8814, 0x1908, 0x1406),
+    "rgb9e5": (0x8C3D, 0x1907, 0x8C3E),
+    "b10g11r11": (0x8C3A, 0x1907, 0x8C3B),
+    "bc6hu": (0x8E8F, 0, 0),
+    "bc6hs": (0x8E8E, 0, 0),
+    "astc4x4hdr": (0x93B0, 0, 0),
+}
+VK = {
+    "rg16f": 83,
+    "rgb16f": 90,
+    "rgba16f": 97,
+    "rgba32f": 109,
+    "b10g11r11": 122,
+    "rgb9e5": 123,
+    "bc6hu": 143,
+    "bc6hs": 144,
+    "astc4x4hdr": 1000066000,
+}
 
 
 def test_ktx_parse_reads_every_ktx2(node_modules, tmp_path):
@@ -430,16 +524,26 @@ def test_ktx_parse_reads_every_ktx2(node_modules, tmp_path):
         assert "error" not in answer, f"{path.name}: {answer}"
         packed = not path.stem.endswith("None")
         assert answer["header"] == {
-            "vkFormat": VK[texture.format], "typeSize": answer["header"]["typeSize"], "pixelWidth": texture.width,
-            "pixelHeight": texture.height, "pixelDepth": 0, "layerCount": texture.layers,
-            "faceCount": texture.faces, "levelCount": len(texture.levels), "supercompressionScheme": 2 * packed,
+            "vkFormat": VK[texture.format],
+            "typeSize": answer["header"]["typeSize"],
+            "pixelWidth": texture.width,
+            "pixelHeight": texture.height,
+            "pixelDepth": 0,
+            "layerCount": texture.layers,
+            "faceCount": texture.faces,
+            "levelCount": len(texture.levels),
+            "supercompressionScheme": 2 * packed,
         }
         descriptor = answer["descriptor"]
         assert (descriptor["transferFunction"], descriptor["colorPrimaries"]) == (1, 1)
         assert descriptor["bytesPlane"][0] == FORMATS[texture.format].size
         # It makes texts of the keys that the specification has, bytes of others.
-        assert answer["keys"] == {"KTXwriter": "whitefurnace", "KTXorientation": "rd", "sh": [*b"0.5 1\0"],
-                                  "raw": [1, 2]}
+        assert answer["keys"] == {
+            "KTXwriter": "whitefurnace",
+            "KTXorientation": "rd",
+            "sh": [*b"0.5 1\0"],
+            "raw": [1, 2],
+        }
         for level, got in zip(texture.levels, answer["levels"], strict=True):
             assert got["unpacked"] == len(level)
             assert packed or got["digest"] == digest(level)
@@ -470,11 +574,14 @@ def test_libktx_uploads_every_face_of_ktx1_and_ktx2(node_modules, tmp_path):
                 data = level[face * size : (face + 1) * size]
                 if path.suffix == ".ktx":  # rows padded to 4 bytes
                     rows = -(-texture.extent(k)[1] // FORMATS[texture.format].block)
-                    data = b"".join(data[i : i + size // rows] + bytes(-(size // rows) % 4)
-                                    for i in range(0, size, size // rows))
+                    data = b"".join(
+                        data[i : i + size // rows] + bytes(-(size // rows) % 4) for i in range(0, size, size // rows)
+                    )
                 wanted[target, k] = (*texture.extent(k), *GL[texture.format], digest(data))
-        got = {(u["target"], u["level"]): (u["width"], u["height"], u["kind"], u["format"], u["type"], u["digest"])
-               for u in answer["uploads"]}
+        got = {
+            (u["target"], u["level"]): (u["width"], u["height"], u["kind"], u["format"], u["type"], u["digest"])
+            for u in answer["uploads"]
+        }
         assert got == wanted, path.name
 
 
@@ -483,10 +590,20 @@ def test_filament_reads_its_ktx1(node_modules, tmp_path):
     ktx1.write_ktx1(tmp_path / "filament.ktx", texture)
     answer = others(node_modules, [tmp_path / "filament.ktx"])["filament.ktx", "filament"]
     assert answer == {
-        "file": str(tmp_path / "filament.ktx"), "reader": "filament", "layers": 1, "cube": True,
-        "sh": "0.5 0.25 1\n", "internal": "R11F_G11F_B10F", "format": "RGB", "type": "UINT_10F_11F_11F_REV",
-        "faces": [{"level": k, "face": face, "digest": digest(level[face * size : (face + 1) * size])}
-                  for k, level in enumerate(texture.levels) for size in [len(level) // 6] for face in range(6)],
+        "file": str(tmp_path / "filament.ktx"),
+        "reader": "filament",
+        "layers": 1,
+        "cube": True,
+        "sh": "0.5 0.25 1\n",
+        "internal": "R11F_G11F_B10F",
+        "format": "RGB",
+        "type": "UINT_10F_11F_11F_REV",
+        "faces": [
+            {"level": k, "face": face, "digest": digest(level[face * size : (face + 1) * size])}
+            for k, level in enumerate(texture.levels)
+            for size in [len(level) // 6]
+            for face in range(6)
+        ],
     }
 
 
@@ -509,25 +626,28 @@ def patched(data: bytes, at: int, *values: int, wide: bool = False) -> bytes:
     return data[:at] + new + data[at + len(new) :]
 
 
-@pytest.mark.parametrize("at, value, says", [
-    (12, 0x01020304, ["endianness", "little-endian"]),
-    (16, 5, ["glType 0x0005", "0x8c3a"]),
-    (28, 0x8058, ["glInternalFormat is 0x8058", "known are", "0x881a (rgba16f)"]),
-    (36, 0, ["0 x 8", "1 to 65536"]),
-    (36, 0xFFFFFFFF, ["4294967295 x 8", "1 to 65536"]),
-    (36, 16, ["16 x 8", "square"]),
-    (44, 7, ["pixelDepth is 7"]),
-    (48, 0xFFFFFFFF, ["4294967295 layers", "2048"]),
-    (48, 1, ["imageSize of level 0 is 256", "has 1536"]),
-    (52, 5, ["5 faces", "1 or 6"]),
-    (56, 9, ["9 levels", "1 to 4"]),
-    (60, 0xFFFFFFFC, ["truncated", "key-value"]),
-    (60, 41, ["multiple of 4"]),
-    (64, 1000, ["key-value pair at byte 64", "1000 bytes"]),
-    (64, 1, ["key-value pair at byte 64", "1 bytes"]),
-    (68, 0xFFFFFFFF, ["UTF-8"]),
-    (92, 300, ["imageSize of level 0 is 300", "has 256"]),
-])
+@pytest.mark.parametrize(
+    "at, value, says",
+    [
+        (12, 0x01020304, ["endianness", "little-endian"]),
+        (16, 5, ["glType 0x0005", "0x8c3a"]),
+        (28, 0x8058, ["glInternalFormat is 0x8058", "known are", "0x881a (rgba16f)"]),
+        (36, 0, ["0 x 8", "1 to 65536"]),
+        (36, 0xFFFFFFFF, ["4294967295 x 8", "1 to 65536"]),
+        (36, 16, ["16 x 8", "square"]),
+        (44, 7, ["pixelDepth is 7"]),
+        (48, 0xFFFFFFFF, ["4294967295 layers", "2048"]),
+        (48, 1, ["imageSize of level 0 is 256", "has 1536"]),
+        (52, 5, ["5 faces", "1 or 6"]),
+        (56, 9, ["9 levels", "1 to 4"]),
+        (60, 0xFFFFFFFC, ["truncated", "key-value"]),
+        (60, 41, ["multiple of 4"]),
+        (64, 1000, ["key-value pair at byte 64", "1000 bytes"]),
+        (64, 1, ["key-value pair at byte 64", "1 bytes"]),
+        (68, 0xFFFFFFFF, ["UTF-8"]),
+        (92, 300, ["imageSize of level 0 is 300", "has 256"]),
+    ],
+)
 def test_lies_of_ktx1_are_found(at, value, says):
     data = ktx1.ktx1_bytes(made("b10g11r11"))
     assert struct.unpack_from("<I", data, 92) == (256,)
@@ -535,31 +655,34 @@ def test_lies_of_ktx1_are_found(at, value, says):
 
 
 @pytest.mark.parametrize("packed", [False, True])
-@pytest.mark.parametrize("at, value, says", [
-    (12, 37, ["vkFormat is 37", "known are", "97 (rgba16f)"]),
-    (16, 1, ["typeSize is 1", "has 4"]),
-    (20, 0, ["0 x 8", "1 to 65536"]),
-    (20, 16, ["16 x 8", "square"]),
-    (28, 1, ["pixelDepth is 1"]),
-    (32, 3000, ["3000 layers", "2048"]),
-    (36, 2, ["2 faces", "1 or 6"]),
-    (40, 31, ["31 levels", "1 to 4"]),
-    (44, 1, ["scheme is 1 (BasisLZ)", "2 (Zstandard)"]),
-    (44, 77, ["scheme is 77 (unknown)"]),
-    (48, 0xFFFFFFFF, ["truncated", "data format descriptor"]),
-    (52, 16, ["descriptor has 16 bytes", "at least 28"]),
-    (52, 200, ["says that it has 124 bytes", "200"]),
-    (56, 0xFFFFFFF0, ["truncated", "key-value"]),
-    (60, 0xFFFFFFF0, ["truncated", "key-value"]),
-    (72, 8, ["global data"]),
-    (80, 3, ["level 0", "byte 3", "inside the header"]),
-    (84, 0x7FFFFFFF, ["truncated", "level 0"]),  # the upper half of its offset
-    (96, 7, ["level 0", "7 bytes"]),
-    (80 + 96 + 4, 1, ["basic descriptor block"]),
-    (80 + 96 + 8, 0xFFFF0002, ["basic descriptor block"]),
-    (80 + 96 + 12, 0x0101A2, ["colour model 162", "colour model 1"]),
-    (80 + 96 + 20, 9, ["9 bytes a texel", "has 4"]),
-])
+@pytest.mark.parametrize(
+    "at, value, says",
+    [
+        (12, 37, ["vkFormat is 37", "known are", "97 (rgba16f)"]),
+        (16, 1, ["typeSize is 1", "has 4"]),
+        (20, 0, ["0 x 8", "1 to 65536"]),
+        (20, 16, ["16 x 8", "square"]),
+        (28, 1, ["pixelDepth is 1"]),
+        (32, 3000, ["3000 layers", "2048"]),
+        (36, 2, ["2 faces", "1 or 6"]),
+        (40, 31, ["31 levels", "1 to 4"]),
+        (44, 1, ["scheme is 1 (BasisLZ)", "2 (Zstandard)"]),
+        (44, 77, ["scheme is 77 (unknown)"]),
+        (48, 0xFFFFFFFF, ["truncated", "data format descriptor"]),
+        (52, 16, ["descriptor has 16 bytes", "at least 28"]),
+        (52, 200, ["says that it has 124 bytes", "200"]),
+        (56, 0xFFFFFFF0, ["truncated", "key-value"]),
+        (60, 0xFFFFFFF0, ["truncated", "key-value"]),
+        (72, 8, ["global data"]),
+        (80, 3, ["level 0", "byte 3", "inside the header"]),
+        (84, 0x7FFFFFFF, ["truncated", "level 0"]),  # the upper half of its offset
+        (96, 7, ["level 0", "7 bytes"]),
+        (80 + 96 + 4, 1, ["basic descriptor block"]),
+        (80 + 96 + 8, 0xFFFF0002, ["basic descriptor block"]),
+        (80 + 96 + 12, 0x0101A2, ["colour model 162", "colour model 1"]),
+        (80 + 96 + 20, 9, ["9 bytes a texel", "has 4"]),
+    ],
+)
 def test_lies_of_ktx2_are_found(at, value, says, packed):
     data = ktx2.ktx2_bytes(made("rgb9e5"), zstd=3 if packed else None)
     refused(patched(data, at, value), *says)
@@ -608,22 +731,25 @@ def test_lies_of_zstandard_are_found_before_memory_is_taken():
     refused(patched(huge, 36, 6), "at most 8589934592")
 
 
-@pytest.mark.parametrize("at, value, says", [
-    (4, 123, ["123 and 32 bytes"]),
-    (12, 70000, ["8 x 70000"]),
-    (16, 16, ["16 x 8", "square"]),
-    (28, 20, ["20 levels", "1 to 4"]),
-    (28, 3, ["describes", "the file has"]),
-    (76, 31, ["124 and 31 bytes"]),
-    (80, 0x40, ["integers"]),
-    (84, 0x31545844, ["FourCC is 0x31545844", "DX10"]),
-    (112, 0x200000, ["3-D"]),
-    (128, 28, ["dxgiFormat is 28", "known are", "10 (rgba16f)"]),
-    (132, 4, ["resourceDimension is 4"]),
-    (140, 0, ["arraySize is 0"]),
-    (140, 0xFFFFFFFF, ["4294967295 layers", "2048"]),
-    (140, 2, ["describes", "the file has"]),
-])
+@pytest.mark.parametrize(
+    "at, value, says",
+    [
+        (4, 123, ["123 and 32 bytes"]),
+        (12, 70000, ["8 x 70000"]),
+        (16, 16, ["16 x 8", "square"]),
+        (28, 20, ["20 levels", "1 to 4"]),
+        (28, 3, ["describes", "the file has"]),
+        (76, 31, ["124 and 31 bytes"]),
+        (80, 0x40, ["integers"]),
+        (84, 0x31545844, ["FourCC is 0x31545844", "DX10"]),
+        (112, 0x200000, ["3-D"]),
+        (128, 28, ["dxgiFormat is 28", "known are", "10 (rgba16f)"]),
+        (132, 4, ["resourceDimension is 4"]),
+        (140, 0, ["arraySize is 0"]),
+        (140, 0xFFFFFFFF, ["4294967295 layers", "2048"]),
+        (140, 2, ["describes", "the file has"]),
+    ],
+)
 def test_lies_of_dds_are_found(at, value, says):
     refused(patched(dds.dds_bytes(made("rgba16f")), at, value), *says)
 
@@ -643,9 +769,11 @@ def fuzzed(count: int, seed: int) -> int:
     """How many of `count` inputs, mutations of valid files and noise, were taken for textures; any error but
     `InputError` passes through."""
     rng = random.Random(seed)
-    seeds = [write(made(form, shape, seed, **({} if kind == "dds" else {"key_values": {"sh": b"1 2\0"}})))
-             for kind, write in BYTES.items() for form, shape in
-             (("b10g11r11", "cube"), ("rgba16f", "image"), ("bc6hu", "cubes"), ("rgb9e5", "array"))]
+    seeds = [
+        write(made(form, shape, seed, **({} if kind == "dds" else {"key_values": {"sh": b"1 2\0"}})))
+        for kind, write in BYTES.items()
+        for form, shape in (("b10g11r11", "cube"), ("rgba16f", "image"), ("bc6hu", "cubes"), ("rgb9e5", "array"))
+    ]
     magics = (ktx1.IDENTIFIER, ktx2.IDENTIFIER, dds.MAGIC + words(124))
     extremes = (0, 1, 2, 3, 4, 6, 7, 255, 65536, 1 << 31, (1 << 32) - 1, (1 << 32) - 4)
     taken = 0
@@ -703,8 +831,11 @@ def test_one_module_is_the_door_of_zstandard():
     doors = set()
     for path in folder.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [a.name for a in node.names] if isinstance(node, ast.Import) else (
-                [node.module or ""] if isinstance(node, ast.ImportFrom) else [])
+            names = (
+                [a.name for a in node.names]
+                if isinstance(node, ast.Import)
+                else ([node.module or ""] if isinstance(node, ast.ImportFrom) else [])
+            )
             if any(name.split(".")[0] == "zstandard" for name in names):
                 doors.add(path.name)
     assert doors == {"zstd.py"}

@@ -113,9 +113,7 @@ def test_bands_of_a_tall_image_join(tmp_path):
         np.testing.assert_array_equal(read_image(save(tmp_path / name, pixels, **options)).pixels, pixels)
 
 
-@pytest.mark.parametrize(
-    "suffix, kind", [("png", "uint8"), ("png", "uint16"), ("tif", "uint16"), ("bmp", "uint8")]
-)
+@pytest.mark.parametrize("suffix, kind", [("png", "uint8"), ("png", "uint16"), ("tif", "uint16"), ("bmp", "uint8")])
 def test_integers_are_decoded_from_srgb(tmp_path, suffix, kind):
     top = np.iinfo(kind).max
     codes = np.linspace(0, top, 16 * 32 * 3).round().astype(kind).reshape(16, 32, 3)
@@ -366,9 +364,7 @@ def test_what_is_valid_and_not_an_environment(tmp_path, pixels):
     refused(save(tmp_path / "w.exr", pixels, full=(0, 0, 40, 16)), InputError, "data window")
     refused(save(tmp_path / "w2.exr", pixels, window=(1, 0), full=(0, 0, 32, 16)), InputError, "data window")
     refused(save(tmp_path / "deep.exr", pixels, deep=True), InputError, "deep")
-    refused(
-        save(tmp_path / "wide.exr", np.zeros((1, 70000, 1), np.float32)), InputError, "70000 x 1", "65536"
-    )
+    refused(save(tmp_path / "wide.exr", np.zeros((1, 70000, 1), np.float32)), InputError, "70000 x 1", "65536")
 
 
 # --- what is written ------------------------------------------------------------------------------------
@@ -381,9 +377,7 @@ def only(folder: Path) -> list[str]:
 def test_exr_reads_back_elsewhere_with_its_attributes(tmp_path, pixels):
     pixels[0, 0] = 1e30, 3e38, -0.0
     path = tmp_path / "a.exr"
-    write_exr(
-        path, pixels, attributes={"whitefurnace:key": "abc", "whitefurnace:levels": 5, "roughness": 0.25}
-    )
+    write_exr(path, pixels, attributes={"whitefurnace:key": "abc", "whitefurnace:levels": 5, "roughness": 0.25})
     back = oiio.ImageInput.open(str(path))
     spec = back.spec()
     assert str(spec.format) == "float" and spec.getattribute("compression") == "zip"
@@ -514,9 +508,7 @@ def full_disk(tmp_path):
         pytest.skip("only root on Linux can mount a small tmpfs")
     disk = tmp_path / "disk"
     disk.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(disk)], capture_output=True
-    )
+    mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=16k", "tmpfs", str(disk)], capture_output=True)
     if mounted.returncode:
         pytest.skip("mounting a tmpfs is not allowed here")
     yield disk
@@ -551,13 +543,9 @@ def test_what_does_not_read_back_is_not_kept(tmp_path, pixels, monkeypatch):
 
 
 def test_openimageio_is_loaded_late_and_by_one_package():
-    script = (
-        "import sys, whitefurnace.files, whitefurnace.sphere.environments; sys.exit('OpenImageIO' in sys.modules)"
-    )
+    script = "import sys, whitefurnace.files, whitefurnace.sphere.environments; sys.exit('OpenImageIO' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", script]).returncode == 0
 
 
 def test_errors_are_of_the_tree():
-    assert (
-        issubclass(InputError, WhitefurnaceError) and InputError.exit_code == 3 and FileError.exit_code == 2
-    )
+    assert issubclass(InputError, WhitefurnaceError) and InputError.exit_code == 3 and FileError.exit_code == 2

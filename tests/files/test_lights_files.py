@@ -95,27 +95,35 @@ def chunk(kind: bytes, body: bytes) -> bytes:
 
 def png_of(header=(4, 4, 8, 6, 0, 0, 0), pixels=None, extra=b"") -> bytes:
     pixels = bytes(4 * 17) if pixels is None else pixels
-    return (b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", struct.pack(">2I5B", *header)) + extra
-            + chunk(b"IDAT", zlib.compress(pixels)) + chunk(b"IEND", b""))
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", struct.pack(">2I5B", *header))
+        + extra
+        + chunk(b"IDAT", zlib.compress(pixels))
+        + chunk(b"IEND", b"")
+    )
 
 
-@pytest.mark.parametrize("data, says", [
-    (b"", "would take bytes 0 to 8"),
-    (b"GIF89a..", "signature"),
-    (png_of((0, 4, 8, 6, 0, 0, 0)), "1 to 32768"),
-    (png_of((1 << 31, 4, 8, 6, 0, 0, 0)), "1 to 32768"),
-    (png_of((32768, 32768, 8, 6, 0, 0, 0)), "cannot hold"),
-    (png_of((4, 4, 8, 6, 0, 0, 1)), "interlaced"),
-    (png_of((4, 4, 16, 6, 0, 0, 0)), "16 bits"),
-    (png_of((4, 5, 8, 6, 0, 0, 0)), "inflate to 68 bytes, its header needs 85"),
-    (png_of((4, 3, 8, 6, 0, 0, 0)), "inflate to more than 51"),
-    (png_of(pixels=b"\5" + bytes(67)), "filter"),
-    (png_of(extra=chunk(b"ABCD", b"")), "needs the chunk 'ABCD'"),
-    (png_of((4, 4, 8, 2, 0, 0, 0), bytes(52), chunk(b"tRNS", bytes(6))), "transparent colour"),
-    (png_of()[:-13] + b"\0" + png_of()[-12:], "checksum"),
-    (b"\x89PNG\r\n\x1a\n" + chunk(b"IDAT", b""), "first chunk"),
-    (png_of()[:33] + chunk(b"IEND", b""), "no pixels"),
-])
+@pytest.mark.parametrize(
+    "data, says",
+    [
+        (b"", "would take bytes 0 to 8"),
+        (b"GIF89a..", "signature"),
+        (png_of((0, 4, 8, 6, 0, 0, 0)), "1 to 32768"),
+        (png_of((1 << 31, 4, 8, 6, 0, 0, 0)), "1 to 32768"),
+        (png_of((32768, 32768, 8, 6, 0, 0, 0)), "cannot hold"),
+        (png_of((4, 4, 8, 6, 0, 0, 1)), "interlaced"),
+        (png_of((4, 4, 16, 6, 0, 0, 0)), "16 bits"),
+        (png_of((4, 5, 8, 6, 0, 0, 0)), "inflate to 68 bytes, its header needs 85"),
+        (png_of((4, 3, 8, 6, 0, 0, 0)), "inflate to more than 51"),
+        (png_of(pixels=b"\5" + bytes(67)), "filter"),
+        (png_of(extra=chunk(b"ABCD", b"")), "needs the chunk 'ABCD'"),
+        (png_of((4, 4, 8, 2, 0, 0, 0), bytes(52), chunk(b"tRNS", bytes(6))), "transparent colour"),
+        (png_of()[:-13] + b"\0" + png_of()[-12:], "checksum"),
+        (b"\x89PNG\r\n\x1a\n" + chunk(b"IDAT", b""), "first chunk"),
+        (png_of()[:33] + chunk(b"IEND", b""), "no pixels"),
+    ],
+)
 def test_lies_of_png_are_found(data, says):
     assert decode_png(png_of()).shape == (4, 4, 4)
     refused(decode_png, data, says)
@@ -156,8 +164,11 @@ def made_env(size: int = 4, **options) -> env.EnvMap:
     return env.EnvMap(chain(size), **options)
 
 
-FULL = {"polynomials": np.arange(27).reshape(9, 3) / 7, "irradiance": lognormal((6, 2, 2, 3), 9),
-        "dominant": (0.0, 1.0, 0.5)}
+FULL = {
+    "polynomials": np.arange(27).reshape(9, 3) / 7,
+    "irradiance": lognormal((6, 2, 2, 3), 9),
+    "dominant": (0.0, 1.0, 0.5),
+}
 
 
 def split(data: bytes) -> tuple[dict, bytes]:
@@ -241,8 +252,10 @@ def test_env_of_others():
     wanted = [codes[k][::-1, :, :3].astype(float) for k in range(12)]
     wanted = [(c / 255) ** 2.2 * 255 / codes[k][::-1, :, 3:] for k, c in enumerate(wanted)]
     for data in (
-        file(blobs("png"), version=1), file(blobs("png", icc_profile=b"p" * 99), version=2, irradiance=None),
-        file(blobs("webp", lossless=True, exact=True), version=2, imageType="image/webp"), file(blobs("png")),
+        file(blobs("png"), version=1),
+        file(blobs("png", icc_profile=b"p" * 99), version=2, irradiance=None),
+        file(blobs("webp", lossless=True, exact=True), version=2, imageType="image/webp"),
+        file(blobs("png")),
     ):
         read = env.parse_env(Source(data, "a file"))
         assert read.lod_scale == 0.8 and read.polynomials is None and read.irradiance is None
@@ -266,35 +279,38 @@ def change(data: bytes, **changes) -> bytes:
     return joined(manifest, payload)
 
 
-@pytest.mark.parametrize("changes, says", [
-    ({"version": 3}, "version is 3, 1 to 2"),
-    ({"width": None}, "width is missing, a whole number"),
-    ({"width": 12}, "power of two"),
-    ({"width": 1 << 40}, "1 to 8192"),
-    ({"width": 4.5}, "whole number"),
-    ({"width": True}, "whole number"),
-    ({"width": 8}, "has 18 entries, 24 are allowed"),
-    ({"width": float("nan")}, "not finite, a whole number"),
-    ({"imageType": "image/gif"}, "image/gif"),
-    ({"specular": None}, "specular is missing"),
-    ({"specular": [1]}, "specular is an array, an object"),
-    ({"specular__mipmaps": [{}] * 100}, "has 100 entries, 18"),
-    ({"specular__mipmaps__3": 7}, "entry 3 of specular.mipmaps is 7"),
-    ({"specular__mipmaps__3__length": 0}, "length of entry 3"),
-    ({"specular__mipmaps__3__length": 1 << 62}, "length of entry 3"),
-    ({"specular__mipmaps__3__position": -1}, "position of entry 3"),
-    ({"specular__mipmaps__17__position": 10**6}, "position of entry 17"),
-    ({"specular__mipmaps__3__position": 0}, "overlap"),
-    ({"specular__lodGenerationScale": "a"}, "lodGenerationScale is a text"),
-    ({"specular__lodGenerationScale": 1e999}, "lodGenerationScale is not finite"),
-    ({"irradiance__zx": None}, "entry 7 of irradiance .* is missing"),
-    ({"irradiance__zx": [1, 2]}, "entry 7 of irradiance .* has 2 entries, 3"),
-    ({"irradiance__zx__1": float("inf")}, "not finite"),
-    ({"irradiance__irradianceTexture__size": 3}, "power of two"),
-    ({"irradiance__irradianceTexture__size": 4}, "2 x 2 pixels, 4 x 4 were expected"),
-    ({"irradiance__irradianceTexture__faces": []}, "faces has 0 entries"),
-    ({"irradiance__irradianceTexture__dominantDirection": [1, 2]}, "dominantDirection has 2"),
-])
+@pytest.mark.parametrize(
+    "changes, says",
+    [
+        ({"version": 3}, "version is 3, 1 to 2"),
+        ({"width": None}, "width is missing, a whole number"),
+        ({"width": 12}, "power of two"),
+        ({"width": 1 << 40}, "1 to 8192"),
+        ({"width": 4.5}, "whole number"),
+        ({"width": True}, "whole number"),
+        ({"width": 8}, "has 18 entries, 24 are allowed"),
+        ({"width": float("nan")}, "not finite, a whole number"),
+        ({"imageType": "image/gif"}, "image/gif"),
+        ({"specular": None}, "specular is missing"),
+        ({"specular": [1]}, "specular is an array, an object"),
+        ({"specular__mipmaps": [{}] * 100}, "has 100 entries, 18"),
+        ({"specular__mipmaps__3": 7}, "entry 3 of specular.mipmaps is 7"),
+        ({"specular__mipmaps__3__length": 0}, "length of entry 3"),
+        ({"specular__mipmaps__3__length": 1 << 62}, "length of entry 3"),
+        ({"specular__mipmaps__3__position": -1}, "position of entry 3"),
+        ({"specular__mipmaps__17__position": 10**6}, "position of entry 17"),
+        ({"specular__mipmaps__3__position": 0}, "overlap"),
+        ({"specular__lodGenerationScale": "a"}, "lodGenerationScale is a text"),
+        ({"specular__lodGenerationScale": 1e999}, "lodGenerationScale is not finite"),
+        ({"irradiance__zx": None}, "entry 7 of irradiance .* is missing"),
+        ({"irradiance__zx": [1, 2]}, "entry 7 of irradiance .* has 2 entries, 3"),
+        ({"irradiance__zx__1": float("inf")}, "not finite"),
+        ({"irradiance__irradianceTexture__size": 3}, "power of two"),
+        ({"irradiance__irradianceTexture__size": 4}, "2 x 2 pixels, 4 x 4 were expected"),
+        ({"irradiance__irradianceTexture__faces": []}, "faces has 0 entries"),
+        ({"irradiance__irradianceTexture__dominantDirection": [1, 2]}, "dominantDirection has 2"),
+    ],
+)
 def test_lies_of_env_are_found(changes, says):
     data = env.env_bytes(made_env(4, **FULL))[0]
     env.parse_env(Source(change(data), "a file"))
@@ -306,8 +322,14 @@ def test_more_lies_of_env():
     end = data.index(0, 8)
     for cut in [*range(0, end, 7), end, *range(end + 1, len(data), 97), len(data) - 1]:
         refused(env.parse_env, data[:cut], "some/file")
-    for text, says in (("", "not JSON"), ("[]", "not a JSON object"), ("[" * 100_000, "not JSON"), ("{", "not JSON"),
-                       ('{"width":' + "9" * 5000 + "}", "not JSON|width is"), ("{}", "width is missing")):
+    for text, says in (
+        ("", "not JSON"),
+        ("[]", "not a JSON object"),
+        ("[" * 100_000, "not JSON"),
+        ("{", "not JSON"),
+        ('{"width":' + "9" * 5000 + "}", "not JSON|width is"),
+        ("{}", "width is missing"),
+    ):
         refused(env.parse_env, joined(text, b""), says)
     refused(env.parse_env, data[:8] + b" " * (1 << 21), "does not end within")
     refused(env.parse_env, data[:7] + b"7" + data[8:], "magic number")
@@ -410,21 +432,32 @@ def test_images_in_a_glb_in_buffers_and_in_files(tmp_path):
     found = document(light)
     images = [blob(image["uri"]) for image in found["images"]]
     places = np.cumsum([0, *map(len, images)]).tolist()
-    views = [{"buffer": 0, "byteOffset": at, "byteLength": len(image)}
-             for at, image in zip(places, images, strict=False)]
+    views = [
+        {"buffer": 0, "byteOffset": at, "byteLength": len(image)} for at, image in zip(places, images, strict=False)
+    ]
     viewed = [{"bufferView": k, "mimeType": "image/png"} for k in range(len(images))]
     binary = b"".join(images)
     (tmp_path / "a.glb").write_bytes(
-        glb(found | {"images": viewed, "bufferViews": views, "buffers": [{"byteLength": len(binary)}]}, binary))
+        glb(found | {"images": viewed, "bufferViews": views, "buffers": [{"byteLength": len(binary)}]}, binary)
+    )
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub" / "all of it.bin").write_bytes(binary)
-    (tmp_path / "b.gltf").write_text(json.dumps(found | {
-        "images": viewed, "bufferViews": views,
-        "buffers": [{"uri": "sub/all%20of%20it.bin", "byteLength": len(binary)}]}))
+    (tmp_path / "b.gltf").write_text(
+        json.dumps(
+            found
+            | {
+                "images": viewed,
+                "bufferViews": views,
+                "buffers": [{"uri": "sub/all%20of%20it.bin", "byteLength": len(binary)}],
+            }
+        )
+    )
     for k, image in enumerate(images):
         (tmp_path / "sub" / f"{k}.png").write_bytes(image)
-    (tmp_path / "c.gltf").write_text(json.dumps(found | {
-        "images": [{"uri": f"sub/../sub/{k}.png"} for k in range(len(images))]}), encoding="utf-8-sig")
+    (tmp_path / "c.gltf").write_text(
+        json.dumps(found | {"images": [{"uri": f"sub/../sub/{k}.png"} for k in range(len(images))]}),
+        encoding="utf-8-sig",
+    )
     for name in ("a.glb", "b.gltf", "c.gltf"):
         (got,) = files.read_gltf_lights(tmp_path / name)
         for a, b in zip(got.levels, light.levels, strict=True):
@@ -445,9 +478,23 @@ def test_colours_without_alpha_are_read_as_the_engine_does():
     refused(lambda source: decode_face(source, 4), b"BM" + bytes(99), "PNG, WebP or JPEG")
 
 
-@pytest.mark.parametrize("uri", ["../out.png", "sub/../../out.png", "%2e%2e/out.png", "/etc/hostname", "file:///out.png",
-                                 "http://example.org/a.png", "C:/out.png", "..\\out.png", "link.png", "a\0b", "",
-                                 "\\\\host\\a"])
+@pytest.mark.parametrize(
+    "uri",
+    [
+        "../out.png",
+        "sub/../../out.png",
+        "%2e%2e/out.png",
+        "/etc/hostname",
+        "file:///out.png",
+        "http://example.org/a.png",
+        "C:/out.png",
+        "..\\out.png",
+        "link.png",
+        "a\0b",
+        "",
+        "\\\\host\\a",
+    ],
+)
 def test_no_uri_leaves_the_folder(tmp_path, uri):
     folder = tmp_path / "folder"
     (folder / "sub").mkdir(parents=True)
@@ -479,38 +526,63 @@ def lied(**changes) -> dict:
 ONE = base64.b64encode(png_of()).decode()
 
 
-@pytest.mark.parametrize("changes, says", [
-    ({"extensions": {}}, "without EXT_lights_image_based"),
-    ({"extensions": {"EXT_lights_image_based": {"lights": []}}}, "0 entries"),
-    ({"extensions": {"EXT_lights_image_based": {"lights": [{}] * 17}}}, "17 entries, 1 to 16"),
-    ({"extensions": {"EXT_lights_image_based": {"lights": [{"specularImageSize": 8192, "specularImages": [[0] * 6] * 14,
-                                                            "irradianceCoefficients": [[0] * 3] * 9}] * 4}}},
-     "bytes of texels, at most 8589934592"),
-    ({"specularImageSize": 6}, "power of two"),
-    ({"specularImageSize": 1 << 30}, "1 to 8192"),
-    ({"specularImageSize": 16}, "8 x 8 pixels, 16 x 16"),
-    ({"specularImages": []}, "0 entries, 1 to 4"),
-    ({"specularImages": [[0] * 6] * 5}, "5 entries, 1 to 4"),
-    ({"specularImages": [[0] * 5]}, "5 entries, 6"),
-    ({"specularImages": [[-1] * 6]}, "0 to 17"),
-    ({"specularImages": [["a"] * 6]}, "a text, a whole number"),
-    ({"specularImages": [[999] * 6]}, "999, 0 to 17"),
-    ({"irradianceCoefficients": [[1, 2, 3]] * 8}, "8 entries, 9"),
-    ({"irradianceCoefficients": [[1, 2, "3"]] * 9}, "a finite number"),
-    ({"rotation": [0, 0, 1]}, "3 entries, 4"),
-    ({"intensity": None}, "intensity of light 0 is missing"),
-    ({"images": []}, "there is none"),
-    ({"images": {"a": 1}}, "images is an object"),
-    ({"images": [{"uri": "data:image/png;base64,***"}] * 18}, "not valid base64"),
-    ({"images": [{"uri": "data:image/png,abc"}] * 18}, "not in base64"),
-    ({"images": [{"uri": 7}] * 18}, "is 7, a text"),
-    ({"images": [{"uri": "data:;base64," + ONE}] * 18}, "4 x 4 pixels, 8 x 8"),
-    ({"images": [{}] * 18}, "bufferView, there is none"),
-    ({"images": [{"bufferView": 0}] * 18, "bufferViews": [{"buffer": 0, "byteLength": 9}], "buffers": [{}]},
-     "no binary chunk"),
-    ({"images": [{"bufferView": 0}] * 18, "buffers": [{"uri": "data:;base64," + ONE}],
-      "bufferViews": [{"buffer": 0, "byteOffset": 2, "byteLength": len(png_of())}]}, "buffer 0 has"),
-])
+@pytest.mark.parametrize(
+    "changes, says",
+    [
+        ({"extensions": {}}, "without EXT_lights_image_based"),
+        ({"extensions": {"EXT_lights_image_based": {"lights": []}}}, "0 entries"),
+        ({"extensions": {"EXT_lights_image_based": {"lights": [{}] * 17}}}, "17 entries, 1 to 16"),
+        (
+            {
+                "extensions": {
+                    "EXT_lights_image_based": {
+                        "lights": [
+                            {
+                                "specularImageSize": 8192,
+                                "specularImages": [[0] * 6] * 14,
+                                "irradianceCoefficients": [[0] * 3] * 9,
+                            }
+                        ]
+                        * 4
+                    }
+                }
+            },
+            "bytes of texels, at most 8589934592",
+        ),
+        ({"specularImageSize": 6}, "power of two"),
+        ({"specularImageSize": 1 << 30}, "1 to 8192"),
+        ({"specularImageSize": 16}, "8 x 8 pixels, 16 x 16"),
+        ({"specularImages": []}, "0 entries, 1 to 4"),
+        ({"specularImages": [[0] * 6] * 5}, "5 entries, 1 to 4"),
+        ({"specularImages": [[0] * 5]}, "5 entries, 6"),
+        ({"specularImages": [[-1] * 6]}, "0 to 17"),
+        ({"specularImages": [["a"] * 6]}, "a text, a whole number"),
+        ({"specularImages": [[999] * 6]}, "999, 0 to 17"),
+        ({"irradianceCoefficients": [[1, 2, 3]] * 8}, "8 entries, 9"),
+        ({"irradianceCoefficients": [[1, 2, "3"]] * 9}, "a finite number"),
+        ({"rotation": [0, 0, 1]}, "3 entries, 4"),
+        ({"intensity": None}, "intensity of light 0 is missing"),
+        ({"images": []}, "there is none"),
+        ({"images": {"a": 1}}, "images is an object"),
+        ({"images": [{"uri": "data:image/png;base64,***"}] * 18}, "not valid base64"),
+        ({"images": [{"uri": "data:image/png,abc"}] * 18}, "not in base64"),
+        ({"images": [{"uri": 7}] * 18}, "is 7, a text"),
+        ({"images": [{"uri": "data:;base64," + ONE}] * 18}, "4 x 4 pixels, 8 x 8"),
+        ({"images": [{}] * 18}, "bufferView, there is none"),
+        (
+            {"images": [{"bufferView": 0}] * 18, "bufferViews": [{"buffer": 0, "byteLength": 9}], "buffers": [{}]},
+            "no binary chunk",
+        ),
+        (
+            {
+                "images": [{"bufferView": 0}] * 18,
+                "buffers": [{"uri": "data:;base64," + ONE}],
+                "bufferViews": [{"buffer": 0, "byteOffset": 2, "byteLength": len(png_of())}],
+            },
+            "buffer 0 has",
+        ),
+    ],
+)
 def test_lies_of_gltf_are_found(changes, says):
     assert len(parsed(document())) == 1
     refused(gltf_lights.parse_gltf_lights, json.dumps(lied(**changes)).encode(), says)
@@ -520,8 +592,13 @@ def test_lies_of_glb_are_found():
     data = glb(document(), b"abcd")
     read = gltf_lights.parse_gltf_lights
     assert len(read(Source(data, "a"))) == 1
-    for at, value, says in ((4, 1, "version 1"), (8, 1 << 30, "truncated"), (8, 12, "without JSON"),
-                            (12, 1 << 31, "beyond"), (16, 0x004E4942, "must be its JSON")):
+    for at, value, says in (
+        (4, 1, "version 1"),
+        (8, 1 << 30, "truncated"),
+        (8, 12, "without JSON"),
+        (12, 1 << 31, "beyond"),
+        (16, 0x004E4942, "must be its JSON"),
+    ):
         refused(read, data[:at] + struct.pack("<I", value) + data[at + 4 :], says)
     for cut in (0, 3, 8, 11, 13, 19, 40, len(data) - 1):
         refused(read, data[:cut], "some/file")
@@ -557,8 +634,9 @@ def fuzzed(count: int, seed: int) -> list[int]:
             if action == 0 and data:
                 data[at] ^= 1 << rng.randrange(8)
             elif action == 1:
-                data[at : at + 4] = struct.pack(rng.choice("<>") + "I", rng.choice((0, 1, 8, 255, 1 << 31, len(data),
-                                                                                    rng.getrandbits(32))))
+                data[at : at + 4] = struct.pack(
+                    rng.choice("<>") + "I", rng.choice((0, 1, 8, 255, 1 << 31, len(data), rng.getrandbits(32)))
+                )
             elif action == 2 and rng.random() < 0.3:
                 del data[at:]
             elif action == 3:
@@ -692,8 +770,12 @@ def test_astc_codes_what_is_given():
         # Two weights of a block span this plane of colours only in part, as for BC6H; half of what is left of 0.3.
         np.testing.assert_allclose(decode(made.texture, 0), ramp, rtol=0.075)
         assert bytes(made.texture.levels[0]) == bytes(encode("astc4x4hdr", [ramp[..., :channels]]).texture.levels[0])
-    for value, read, clipped, negative in ((65504, 65504, 0, 0), (1e9, 65504, 3, 0), (-2, 0, 0, 3),
-                                           (np.inf, 65504, 3, 0)):
+    for value, read, clipped, negative in (
+        (65504, 65504, 0, 0),
+        (1e9, 65504, 3, 0),
+        (-2, 0, 0, 3),
+        (np.inf, 65504, 3, 0),
+    ):
         flat = encode("astc4x4hdr", [np.full((1, 1, 3), value)])
         assert (flat.clipped, flat.negative) == ((clipped,), (negative,))
         np.testing.assert_array_equal(decode(flat.texture, 0), [[[read, read, read, 1]]])
@@ -735,9 +817,14 @@ def test_octahedron_both_ways_and_where_the_axes_are():
     u, v = to_square(d)
     assert (np.abs([u, v]) <= 1).all()
     np.testing.assert_allclose(to_direction(u, v), d, atol=1e-15 * 8)
-    for direction, places in (((0, 1, 0), [(0, 0)]), ((1, 0, 0), [(1, 0)]), ((-1, 0, 0), [(-1, 0)]),
-                              ((0, 0, 1), [(0, 1)]), ((0, 0, -1), [(0, -1)]),
-                              ((0, -1, 0), [(1, 1), (-1, 1), (1, -1), (-1, -1)])):
+    for direction, places in (
+        ((0, 1, 0), [(0, 0)]),
+        ((1, 0, 0), [(1, 0)]),
+        ((-1, 0, 0), [(-1, 0)]),
+        ((0, 0, 1), [(0, 1)]),
+        ((0, 0, -1), [(0, -1)]),
+        ((0, -1, 0), [(1, 1), (-1, 1), (1, -1), (-1, -1)]),
+    ):
         for a, b in places:
             np.testing.assert_array_equal(to_direction(np.array([a]), np.array([b]))[:, 0], direction)
     t = np.linspace(-1, 1, 33)
@@ -763,7 +850,7 @@ def test_a_border_makes_every_seam_vanish(b):
         x, y = (u + 1) / 2 * n - 0.5 + b, (v + 1) / 2 * n - 0.5 + b
         j, i = np.floor(x).astype(int), np.floor(y).astype(int)
         a, e = (x - j)[:, None], (y - i)[:, None]
-        return ((of[i, j] * (1 - a) + of[i, j + 1] * a) * (1 - e) + (of[i + 1, j] * (1 - a) + of[i + 1, j + 1] * a) * e)
+        return (of[i, j] * (1 - a) + of[i, j + 1] * a) * (1 - e) + (of[i + 1, j] * (1 - a) + of[i + 1, j + 1] * a) * e
 
     t = np.linspace(-1, 1, 401)
     one = np.ones_like(t)

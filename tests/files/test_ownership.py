@@ -1,4 +1,5 @@
 """Who may overwrite an output, and what the next run makes of a killed one: the same for bakes and for tables."""
+
 from __future__ import annotations
 
 import hashlib

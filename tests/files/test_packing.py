@@ -62,10 +62,14 @@ def test_floats_round_to_the_nearest_code_and_ties_to_the_even_one(name, dtype):
         rng = np.random.default_rng(mantissa)
         lower = rng.integers(0, len(table) - 1, 500)
         middle = np.array([float((table[c] + table[c + 1]) / 2) for c in lower.tolist()])  # 12 bits: exact
-        values = np.concatenate([
-            middle, np.nextafter(middle.astype(dtype), dtype(0)), np.nextafter(middle.astype(dtype), dtype(np.inf)),
-            np.exp2(rng.uniform(-26, 15.99, 500)),
-        ]).astype(dtype)
+        values = np.concatenate(
+            [
+                middle,
+                np.nextafter(middle.astype(dtype), dtype(0)),
+                np.nextafter(middle.astype(dtype), dtype(np.inf)),
+                np.exp2(rng.uniform(-26, 15.99, 500)),
+            ]
+        ).astype(dtype)
         texels = np.zeros((len(values), FORMATS[name].channels), dtype)
         texels[:, channel] = values
         got = codes_of(name, pack(name, texels))[:, channel]
@@ -79,9 +83,12 @@ def test_floats_round_to_the_nearest_code_and_ties_to_the_even_one(name, dtype):
 
 
 def test_half_agrees_with_the_half_of_the_standard_library():
-    values = np.concatenate([
-        np.exp2(np.random.default_rng(0).uniform(-26, 15.99, 4000)), -np.exp2(np.linspace(-30, 15, 800)),
-    ])
+    values = np.concatenate(
+        [
+            np.exp2(np.random.default_rng(0).uniform(-26, 15.99, 4000)),
+            -np.exp2(np.linspace(-30, 15, 800)),
+        ]
+    )
     packed = pack("rg16f", values.reshape(-1, 2))
     assert packed.data.tobytes() == b"".join(struct.pack("<e", v) for v in values.tolist())
 
@@ -107,11 +114,28 @@ def test_shared_exponents_are_those_of_the_specification(dtype):
     rng = np.random.default_rng(3)
     texels = spread(rng, 3000, 3, -30, 16).astype(dtype)
     # Where the largest rounds up to the next exponent, ties, the ends and the smallest steps.
-    texels = np.concatenate([texels, np.array([
-        [0, 0, 0], [1, 1, 1], [511.5 / 512, 0, 0], [511.49 / 512, 0.25, 0], [65408, 65408, 65408], [65471, 1, 0],
-        [2.0**-24, 2.0**-25, 2.0**-26], [2.0**-25, 0, 0], [2.0**-15, 2.0**-16, 0], [256.5, 128.25, 64.125], [1e9, 2, 3],
-        [0.49999999999999994 * 2.0**-24, 0, 0],
-    ], dtype)])
+    texels = np.concatenate(
+        [
+            texels,
+            np.array(
+                [
+                    [0, 0, 0],
+                    [1, 1, 1],
+                    [511.5 / 512, 0, 0],
+                    [511.49 / 512, 0.25, 0],
+                    [65408, 65408, 65408],
+                    [65471, 1, 0],
+                    [2.0**-24, 2.0**-25, 2.0**-26],
+                    [2.0**-25, 0, 0],
+                    [2.0**-15, 2.0**-16, 0],
+                    [256.5, 128.25, 64.125],
+                    [1e9, 2, 3],
+                    [0.49999999999999994 * 2.0**-24, 0, 0],
+                ],
+                dtype,
+            ),
+        ]
+    )
     packed = pack("rgb9e5", texels)
     for got, rgb in zip(word(packed), texels.tolist(), strict=True):
         assert got == shared_exponent(rgb), f"{rgb}: {got:#x} is not {shared_exponent(rgb):#x}"
@@ -142,11 +166,17 @@ def test_rgbd_has_babylons_divisor_and_the_nearest_colour_it_reads():
     assert pack("rgbd", [255.0, 0.0, 0.0]).data.tolist() == [255, 0, 0, 1]
 
 
-@pytest.mark.parametrize("name, largest, over", [
-    # `over` is half an ulp more than `largest`, from where on rounding to nearest gives inf [IEEE 754, 4.3.1]
-    ("rg16f", 65504.0, 65520.0), ("rgb16f", 65504.0, 65520.0), ("rgba16f", 65504.0, 65520.0),
-    ("rgba32f", float(np.finfo(np.float32).max), 2.0**128 - 2.0**103), ("rgb9e5", 65408.0, 65472.0),
-])
+@pytest.mark.parametrize(
+    "name, largest, over",
+    [
+        # `over` is half an ulp more than `largest`, from where on rounding to nearest gives inf [IEEE 754, 4.3.1]
+        ("rg16f", 65504.0, 65520.0),
+        ("rgb16f", 65504.0, 65520.0),
+        ("rgba16f", 65504.0, 65520.0),
+        ("rgba32f", float(np.finfo(np.float32).max), 2.0**128 - 2.0**103),
+        ("rgb9e5", 65408.0, 65472.0),
+    ],
+)
 def test_nothing_becomes_inf_and_what_is_clipped_is_counted(name, largest, over):
     channels = FORMATS[name].channels
     for value, count in ((largest, 0), (np.nextafter(over, 0), 0), (over, 1), (1e300, 1), (np.inf, 1)):
@@ -173,7 +203,7 @@ def test_small_floats_clip_at_each_channels_own_end():
 
 @pytest.mark.parametrize("name", CODED)
 def test_negatives_stay_or_become_0_and_are_counted(name):
-    values = np.array([[-1.0, -0.0, 1.0, 0.5], [-np.inf, 0.25, -2.0**-30, 0.5]])[:, : FORMATS[name].channels]
+    values = np.array([[-1.0, -0.0, 1.0, 0.5], [-np.inf, 0.25, -(2.0**-30), 0.5]])[:, : FORMATS[name].channels]
     packed = pack(name, values)
     read = unpack(name, packed.data, (2,))
     if FORMATS[name].signed:
@@ -195,8 +225,13 @@ def test_nan_is_refused_with_its_place(name, monkeypatch):
 def test_the_step_bounds_the_error_and_no_smaller_one_does(name):
     rng = np.random.default_rng(5)
     entry = FORMATS[name]
-    values = np.concatenate([spread(rng, 20000, entry.channels, -30, 14), spread(rng, 200, entry.channels, 14, 20),
-                             np.zeros((1, entry.channels))])
+    values = np.concatenate(
+        [
+            spread(rng, 20000, entry.channels, -30, 14),
+            spread(rng, 200, entry.channels, 14, 20),
+            np.zeros((1, entry.channels)),
+        ]
+    )
     if name == "rgbd":
         values /= 64  # most of it in range
     values[::7] *= -1
@@ -205,8 +240,9 @@ def test_the_step_bounds_the_error_and_no_smaller_one_does(name):
     bound = step(name, values)
     assert bound.shape == values.shape
     worst = np.argmax(error / bound)
-    assert (error <= bound).all(), (f"{name}: {values.flat[worst]!r} is off by {error.flat[worst]!r}, "
-                                    f"more than {bound.flat[worst]!r}")
+    assert (error <= bound).all(), (
+        f"{name}: {values.flat[worst]!r} is off by {error.flat[worst]!r}, more than {bound.flat[worst]!r}"
+    )
     inside = (values >= 0) & (values < entry.largest)
     # 6e4 uniform places between two codes come nearer to the middle than 1/1000 of the way
     assert (error[inside] / bound[inside]).max() > 0.999
@@ -243,7 +279,10 @@ def test_inf_and_nan_of_foreign_data_are_read_as_they_are():
 def test_unknown_formats_and_blocks_are_named():
     with pytest.raises(UnsupportedError, match="did you mean 'rgb9e5'"):
         pack("rgb9e", [1, 1, 1])
-    for action in (lambda: pack("bc6hu", [1, 1, 1]), lambda: unpack("bc6hu", bytes(16), (4, 4)),
-                   lambda: step("bc6hs", [1, 1, 1])):
+    for action in (
+        lambda: pack("bc6hu", [1, 1, 1]),
+        lambda: unpack("bc6hu", bytes(16), (4, 4)),
+        lambda: step("bc6hs", [1, 1, 1]),
+    ):
         with pytest.raises(UnsupportedError, match="blocks"):
             action()

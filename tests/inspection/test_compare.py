@@ -1,4 +1,5 @@
 """`compare`: errors by the project's definition, worked out here once more; across containers, layouts and axes."""
+
 from __future__ import annotations
 
 import itertools
@@ -52,6 +53,7 @@ def code(*argv) -> int:
 
 def solid_angle(n: int, i: int, j: int) -> float:
     """Of a texel, by four corners: Ω(x, y) = atan(xy / √(1 + x² + y²))."""
+
     def corner(x, y):
         return math.atan2(x * y, math.sqrt(x * x + y * y + 1))
 
@@ -69,10 +71,16 @@ def test_errors_are_those_of_the_definition(tmp_path):
     omega = {(i, j): solid_angle(n, i, j) for i in range(n) for j in range(n)}
     texels = list(itertools.product(range(6), range(n), range(n)))
     mean = sum(omega[i, j] * float(ref[f, i, j].astype(float).mean()) for f, i, j in texels) / (4 * math.pi)
-    errors = sorted(max(abs(float(got[f, i, j, c]) - float(ref[f, i, j, c])) / max(float(ref[f, i, j, c]), 1e-3 * mean)
-                        for c in range(3)) for f, i, j in texels)
-    lost = sum(omega[i, j] * (float(got[f, i, j, c]) - float(ref[f, i, j, c])) ** 2
-               for f, i, j in texels for c in range(3))
+    errors = sorted(
+        max(
+            abs(float(got[f, i, j, c]) - float(ref[f, i, j, c])) / max(float(ref[f, i, j, c]), 1e-3 * mean)
+            for c in range(3)
+        )
+        for f, i, j in texels
+    )
+    lost = sum(
+        omega[i, j] * (float(got[f, i, j, c]) - float(ref[f, i, j, c])) ** 2 for f, i, j in texels for c in range(3)
+    )
     power = sum(omega[i, j] * float(ref[f, i, j, c]) ** 2 for f, i, j in texels for c in range(3))
     raw(tmp_path / "a.npz", [got])
     raw(tmp_path / "b.npz", [ref])
@@ -109,9 +117,17 @@ def test_what_is_not_finite_is_an_infinite_error_unless_both_have_it(tmp_path):
 
 # --- containers -----------------------------------------------------------------------------------------
 
-EVERY = [(suffix, form) for suffix, forms in {
-    ".ktx": ("rgba16f", "rgba32f", "rgb9e5", "b10g11r11"), ".ktx2": ("rgba16f", "rgb9e5", "b10g11r11"),
-    ".dds": ("rgba16f", "rgb9e5"), ".env": ("rgbd",), ".gltf": ("rgbd",)}.items() for form in forms]
+EVERY = [
+    (suffix, form)
+    for suffix, forms in {
+        ".ktx": ("rgba16f", "rgba32f", "rgb9e5", "b10g11r11"),
+        ".ktx2": ("rgba16f", "rgb9e5", "b10g11r11"),
+        ".dds": ("rgba16f", "rgb9e5"),
+        ".env": ("rgbd",),
+        ".gltf": ("rgbd",),
+    }.items()
+    for form in forms
+]
 
 
 @pytest.mark.parametrize("suffix, form", EVERY)
@@ -126,8 +142,12 @@ def test_a_chain_is_itself_in_every_container(tmp_path, suffix, form):
         write_gltf_lights(path, GltfLight(tuple(levels), harmonic.irradiance(sh)))
     else:
         text = " ".join(f"{x:.17g}" for x in harmonic.filament(sh).ravel())
-        write_texture(path, encode(form, levels, cube=True, key_values={} if suffix == ".dds" else {
-            "sh": text.encode() + b"\0"}).texture)
+        write_texture(
+            path,
+            encode(
+                form, levels, cube=True, key_values={} if suffix == ".dds" else {"sh": text.encode() + b"\0"}
+            ).texture,
+        )
     found = compare(contents(path), contents(raw(tmp_path / "b.npz", levels, sh=sh)))
     rows = {row.part: row for row in found.rows}
     assert set(rows) == {f"level {k}" for k in range(5)} | (set() if suffix == ".dds" else {"SH"})
@@ -144,8 +164,11 @@ def test_a_mirrored_or_turned_cube_is_found_and_named(tmp_path, capsys):
     raw(tmp_path / "b.npz", chain())
     mirrored = [level[:, :, ::-1] for level in chain()]
     shifted = [np.roll(level, 1, axis=2) for level in chain()]
-    for name, levels, hint in (("m", mirrored, "each face of A is turned or mirrored by itself: left to right"),
-                               ("s", shifted, ""), ("t", chain(ENGINES["three"].matrix), "--axes-a '-x +y +z'")):
+    for name, levels, hint in (
+        ("m", mirrored, "each face of A is turned or mirrored by itself: left to right"),
+        ("s", shifted, ""),
+        ("t", chain(ENGINES["three"].matrix), "--axes-a '-x +y +z'"),
+    ):
         path = raw(tmp_path / f"{name}.npz", levels)
         assert code(path, tmp_path / "b.npz", "--max-error", "0.05") == 7
         err = capsys.readouterr().err
@@ -180,8 +203,9 @@ def test_a_file_of_a_preset_is_turned_back_by_itself(tmp_path):
     path = tmp_path / "three" / "a.dds"
     path.parent.mkdir()
     write_texture(path, encode("rgba32f", chain(ENGINES["three"].matrix), cube=True).texture)
-    write_manifest(tmp_path / "a.json", {"whitefurnace": "1", "name": "a",
-                                         "files": {"three/a.dds": {"sha256": digest_file(path)}}})
+    write_manifest(
+        tmp_path / "a.json", {"whitefurnace": "1", "name": "a", "files": {"three/a.dds": {"sha256": digest_file(path)}}}
+    )
     found = compare(contents(path), contents(tmp_path / "b.npz"))
     assert max(row.worst for row in found.rows) < 3e-7 and "written for three" in found.notices[0]
     assert compare(contents(path), contents(tmp_path / "b.npz"), axes_a="+x +y +z").rows[0].worst > 0.1
@@ -195,9 +219,15 @@ def test_a_file_of_a_users_engine_is_turned_back_as_its_manifest_says(tmp_path):
     # The key says whose it is, the manifest in which axes that has them.
     write_texture(path, encode("rgba32f", turned, cube=True, key_values={"whitefurnace:engine": b"mine\0"}).texture)
     for axes, fits in (("+x +z -y", True), ("+x +y +z", False), ("sideways", False), (3, False)):
-        write_manifest(tmp_path / "a.json", {
-            "whitefurnace": "1", "name": "a", "recipe": {"engines": {"mine": {"engine": {"axes": axes}}}},
-            "files": {"mine/a.ktx": {"sha256": digest_file(path)}}})
+        write_manifest(
+            tmp_path / "a.json",
+            {
+                "whitefurnace": "1",
+                "name": "a",
+                "recipe": {"engines": {"mine": {"engine": {"axes": axes}}}},
+                "files": {"mine/a.ktx": {"sha256": digest_file(path)}},
+            },
+        )
         found = compare(contents(path), contents(tmp_path / "b.npz"))
         assert (max(row.worst for row in found.rows) < 3e-7) == fits, axes
         assert any("written for mine" in notice for notice in found.notices) == fits
@@ -211,8 +241,11 @@ def test_levels_go_by_size_and_by_roughness_where_both_know_it(tmp_path):
     a = raw(tmp_path / "a.npz", [levels[0], levels[1], 2 * levels[2], 3 * levels[3]], roughness=[0, 0.25, 0.5, 1])
     b = raw(tmp_path / "b.npz", [levels[0], 3 * levels[3], 2 * levels[2]], roughness=[0, 1, 0.5])
     found = compare(contents(a), contents(b))
-    assert [(row.part, row.roughness, row.worst) for row in found.rows] == [("level 0", 0, 0), ("level 1", 1, 0),
-                                                                            ("level 2", 0.5, 0)]
+    assert [(row.part, row.roughness, row.worst) for row in found.rows] == [
+        ("level 0", 0, 0),
+        ("level 1", 1, 0),
+        ("level 2", 0.5, 0),
+    ]
     assert found.notices == ("level 1 (4²) of a.npz: no counterpart",)
     c = raw(tmp_path / "c.npz", [levels[1]], roughness=[0.3])
     with pytest.raises(UnsupportedError, match=r"no level of one roughness"):
@@ -239,8 +272,12 @@ def test_a_lat_long_and_a_cube_are_held_against_each_other(tmp_path):
     """Level 0 of a bake of it is its exact mean; a rough level is read bilinearly and that is said."""
     rows, columns = 32, 64
     theta, phi = (np.arange(rows) + 0.5) * math.pi / rows, (np.arange(columns) + 0.5) * 2 * math.pi / columns - math.pi
-    d = np.stack(np.broadcast_arrays(np.sin(theta)[:, None] * np.cos(phi), np.cos(theta)[:, None],
-                                     np.sin(theta)[:, None] * np.sin(phi)), -1)
+    d = np.stack(
+        np.broadcast_arrays(
+            np.sin(theta)[:, None] * np.cos(phi), np.cos(theta)[:, None], np.sin(theta)[:, None] * np.sin(phi)
+        ),
+        -1,
+    )
     wide = radiance(d).astype(np.float32)
     write_exr(tmp_path / "wide.exr", wide)
     raw(tmp_path / "cube.npz", chain(sizes=(8,)))
@@ -252,8 +289,10 @@ def test_a_lat_long_and_a_cube_are_held_against_each_other(tmp_path):
         write_exr(tmp_path / "turned.exr", turned)
         assert compare(contents(tmp_path / "turned.exr"), contents(tmp_path / "cube.npz")).rows[0].error > 0.3
     write_exr(tmp_path / "mirrored.exr", wide[:, ::-1])  # φ to -φ: z to -z
-    assert compare(contents(tmp_path / "mirrored.exr"), contents(tmp_path / "cube.npz"),
-                   axes_a="+x +y -z").rows[0].worst < 0.05
+    assert (
+        compare(contents(tmp_path / "mirrored.exr"), contents(tmp_path / "cube.npz"), axes_a="+x +y -z").rows[0].worst
+        < 0.05
+    )
     with pytest.raises(UnsupportedError, match="resampled"):
         compare(contents(tmp_path / "wide.exr"), contents(tmp_path / "cube.npz"), axes_a="+y +x +z")
     write_exr(tmp_path / "rough.exr", wide, attributes={"whitefurnace:roughness": 0.5})
@@ -272,7 +311,11 @@ def test_arrays_of_cubes_are_compared_layer_by_layer(tmp_path):
     write_texture(tmp_path / "b.dds", encode("rgba32f", other, cube=True).texture)
     found = compare(contents(tmp_path / "a.ktx2"), contents(tmp_path / "b.dds"))
     assert [(row.part, row.worst) for row in found.rows] == [
-        ("level 0 of layer 0", 0), ("level 0 of layer 1", 0.5), ("level 1 of layer 0", 0), ("level 1 of layer 1", 0.5)]
+        ("level 0 of layer 0", 0),
+        ("level 0 of layer 1", 0.5),
+        ("level 1 of layer 0", 0),
+        ("level 1 of layer 1", 0.5),
+    ]
     with pytest.raises(UnsupportedError, match="arrays"):
         compare(contents(tmp_path / "a.ktx2"), contents(raw(tmp_path / "c.npz", chain())))
 
@@ -314,8 +357,10 @@ def test_error_maps_are_drawn(tmp_path, capsys):
     pytest.importorskip("matplotlib")
     import OpenImageIO as oiio
 
-    a, b = raw(tmp_path / "a.npz", chain(sizes=(8, 4)), dfg=np.ones((4, 4, 2))), raw(
-        tmp_path / "b.npz", [1.01 * level for level in chain(sizes=(8, 4))], dfg=np.zeros((4, 4, 2)))
+    a, b = (
+        raw(tmp_path / "a.npz", chain(sizes=(8, 4)), dfg=np.ones((4, 4, 2))),
+        raw(tmp_path / "b.npz", [1.01 * level for level in chain(sizes=(8, 4))], dfg=np.zeros((4, 4, 2))),
+    )
     for folder in ("p", "q"):
         assert code(a, b, "--plot", tmp_path / folder) == 0
     assert (tmp_path / "p/compare.png").read_bytes() == (tmp_path / "q/compare.png").read_bytes()

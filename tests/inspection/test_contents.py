@@ -1,5 +1,6 @@
 """What is read of any file that we or an engine know: every container gives the levels that were written, `inspect`
 says so, `bake` takes them, and anything else is one sentence."""
+
 from __future__ import annotations
 
 import base64
@@ -40,9 +41,11 @@ from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere.environments import LAYOUTS
 
 SIZES = (8, 4, 2, 1)
-FORMATS = {".ktx": ("rgb16f", "rgba16f", "rgba32f", "rgb9e5", "b10g11r11"),
-           ".ktx2": ("rgb16f", "rgba16f", "rgba32f", "rgb9e5", "b10g11r11"),
-           ".dds": ("rgba16f", "rgba32f", "rgb9e5", "b10g11r11")}
+FORMATS = {
+    ".ktx": ("rgb16f", "rgba16f", "rgba32f", "rgb9e5", "b10g11r11"),
+    ".ktx2": ("rgb16f", "rgba16f", "rgba32f", "rgb9e5", "b10g11r11"),
+    ".dds": ("rgba16f", "rgba32f", "rgb9e5", "b10g11r11"),
+}
 TITLES = {".ktx": "KTX 1", ".ktx2": "KTX 2", ".dds": "DDS", ".env": "Babylon .env", ".gltf": "glTF"}
 
 
@@ -90,8 +93,16 @@ def shown(path: Path) -> str:
 
 def test_arrays_and_strips_are_the_same_cube(tmp_path):
     cube = levels()[0]
-    write_npz(tmp_path / "a.npz", {"specular_0": cube, "roughness": [0.0], "error": [1e-4],
-                                   "sh": np.arange(27.0).reshape(9, 3), "dfg": np.ones((4, 4, 2), np.float32)})
+    write_npz(
+        tmp_path / "a.npz",
+        {
+            "specular_0": cube,
+            "roughness": [0.0],
+            "error": [1e-4],
+            "sh": np.arange(27.0).reshape(9, 3),
+            "dfg": np.ones((4, 4, 2), np.float32),
+        },
+    )
     np.save(tmp_path / "a.npy", cube)
     write_exr(tmp_path / "a.exr", cube.reshape(48, 8, 3))
     for name in ("a.npz", "a.npy", "a.exr"):
@@ -104,7 +115,7 @@ def test_arrays_and_strips_are_the_same_cube(tmp_path):
     cross = np.zeros((32, 24, 3), np.float32)
     layout = next(one for one in LAYOUTS if one.name == "vertical cross")
     for face, cell in zip(cube, layout.cells, strict=True):
-        cross[8 * cell.row:8 * cell.row + 8, 8 * cell.column:8 * cell.column + 8] = np.rot90(face, -cell.turns)
+        cross[8 * cell.row : 8 * cell.row + 8, 8 * cell.column : 8 * cell.column + 8] = np.rot90(face, -cell.turns)
     write_exr(tmp_path / "cross.exr", cross)
     found = contents(tmp_path / "cross.exr")
     assert found.facts["layout"] == "vertical cross" and np.array_equal(found.levels[0].texels, cube)
@@ -158,11 +169,21 @@ def test_a_manifest_proves_a_file_whole_or_not(tmp_path):
     (tmp_path / "three").mkdir()
     path = tmp_path / "three" / "day_1.dds"
     write_texture(path, encode("rgba16f", cube, cube=True).texture)
-    rows = [{"size": 8, "roughness": 0.0, "error": 1e-4, "format_p99": 2e-4},
-            {"size": 4, "roughness": 1.0, "error": 2e-4}]
+    rows = [
+        {"size": 8, "roughness": 0.0, "error": 1e-4, "format_p99": 2e-4},
+        {"size": 4, "roughness": 1.0, "error": 2e-4},
+    ]
     entry = {"sha256": digest_file(path), "bytes": 1, "holds": "specular", "levels": rows}
-    write_manifest(tmp_path / "day_1.json", {"whitefurnace": "1", "name": "day_1", "key": "abcdef0123456789",
-                                             "files": {"three/day_1.dds": entry}, "recipe": {"size": 8}})
+    write_manifest(
+        tmp_path / "day_1.json",
+        {
+            "whitefurnace": "1",
+            "name": "day_1",
+            "key": "abcdef0123456789",
+            "files": {"three/day_1.dds": entry},
+            "recipe": {"size": 8},
+        },
+    )
     found = contents(path)
     assert found.statement.whole and found.written_for == ("three", "-x +y +z")
     assert [level.roughness for level in found.levels] == [0.0, 1.0]
@@ -183,8 +204,10 @@ def test_a_table_is_what_its_manifest_says(tmp_path):
     path = tmp_path / "gold.npy"
     np.save(path, table)
     assert contents(path).kind == "lat-long"
-    write_manifest(tmp_path / "gold.npy.json", {"whitefurnace": "1", "name": "gold.npy", "integral": "albedo",
-                                                "error": 1e-6, "sha256": digest_file(path)})
+    write_manifest(
+        tmp_path / "gold.npy.json",
+        {"whitefurnace": "1", "name": "gold.npy", "integral": "albedo", "error": 1e-6, "sha256": digest_file(path)},
+    )
     found = contents(path)
     assert found.kind == "table" and found.statement.whole and found.levels[0].stated == {"error": 1e-6}
     assert "integral albedo, error 1.0e-06" in shown(path)
@@ -205,14 +228,26 @@ def test_a_header_is_its_array_and_a_texture_without_its_manifest_says_what_it_c
     assert found.kind == "table" and np.array_equal(found.levels[0].texels, table)  # digits that tell every float32
     (tmp_path / "norm.h").write_text("#define NORM(x) (1.0f + (x) * 2.0f)\n")
     assert contents(tmp_path / "norm.h").kind == "code"
-    for text in ("int main;", "static const float t[2][2] = {1, 2, 3};", "static const float t[2] = {1, 2",
-                 "static const float t[999999999][999999999] = {1};"):
+    for text in (
+        "int main;",
+        "static const float t[2][2] = {1, 2, 3};",
+        "static const float t[2] = {1, 2",
+        "static const float t[999999999][999999999] = {1};",
+    ):
         (tmp_path / "bad.h").write_text(text)
         with pytest.raises(InputError):
             contents(tmp_path / "bad.h")
-    path = written(tmp_path, ".ktx2", "rgba16f", key_values={
-        "whitefurnace:engine": text_value("bevy"), "whitefurnace:key": text_value("abcdef"),
-        "whitefurnace:error": text_value("1e-4 2e-4 3e-4 4e-4"), "whitefurnace:manifest": text_value("mine")})
+    path = written(
+        tmp_path,
+        ".ktx2",
+        "rgba16f",
+        key_values={
+            "whitefurnace:engine": text_value("bevy"),
+            "whitefurnace:key": text_value("abcdef"),
+            "whitefurnace:error": text_value("1e-4 2e-4 3e-4 4e-4"),
+            "whitefurnace:manifest": text_value("mine"),
+        },
+    )
     found = contents(path)
     assert found.written_for == ("bevy", "+x +y -z")
     assert found.statement.manifest is None and found.statement.whole is None
@@ -248,8 +283,11 @@ def test_what_is_no_environment_is_one_sentence(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "astc_encoder", None)  # ASTC without what decodes it
     rng = np.random.default_rng(6)
     wrong = {
-        "array.ktx2": (encode("rgba16f", [rng.random((2, 6, 4, 4, 3))], cube=True).texture, InputError,
-                       "array of 2 cubes"),
+        "array.ktx2": (
+            encode("rgba16f", [rng.random((2, 6, 4, 4, 3))], cube=True).texture,
+            InputError,
+            "array of 2 cubes",
+        ),
         "images.dds": (encode("rgba16f", [rng.random((3, 4, 8, 3))]).texture, InputError, "array of 3 images"),
         "two.ktx": (encode("rg16f", [rng.random((4, 8, 2))]).texture, InputError, "2 channels"),
         "square.dds": (encode("rgba16f", [rng.random((8, 8, 3))]).texture, InputError, "aspect ratio"),
@@ -280,8 +318,16 @@ def test_a_cube_in_a_container_bakes_as_its_array_does(tmp_path, device):
 
 def seeds(folder: Path) -> list[Path]:
     chain = [level[:, :4, :4] for level in levels()[1:]]
-    found = [written(folder, suffix, form, chain) for suffix, form in
-             ((".ktx", "b10g11r11"), (".ktx2", "rgb9e5"), (".dds", "rgba16f"), (".env", "rgbd"), (".gltf", "rgbd"))]
+    found = [
+        written(folder, suffix, form, chain)
+        for suffix, form in (
+            (".ktx", "b10g11r11"),
+            (".ktx2", "rgb9e5"),
+            (".dds", "rgba16f"),
+            (".env", "rgbd"),
+            (".gltf", "rgbd"),
+        )
+    ]
     write_npz(folder / "a.npz", {"specular_0": chain[0], "sh": np.zeros((9, 3)), "dfg": np.ones((2, 2, 2))})
     np.save(folder / "a.npy", chain[0])
     with zipfile.ZipFile(folder / "b.npz", "w", zipfile.ZIP_DEFLATED) as archive:
@@ -289,8 +335,9 @@ def seeds(folder: Path) -> list[Path]:
     write_manifest(folder / "m.json", {"whitefurnace": "1", "files": {"a.npy": {"sha256": "0"}}, "sh": {}})
     write_exr(folder / "a.exr", chain[0].reshape(24, 4, 3))
     (folder / "sh.txt").write_text("(1.0, 2, 3e-1); // L00\n" * 9)
-    (folder / "t.h").write_text("// a table\nstatic const float t[2][3] = {\n{1.0f, .5f, 2e-1f},\n{1.0f, 2.0f, 3.0f},\n"
-                                "};\n")
+    (folder / "t.h").write_text(
+        "// a table\nstatic const float t[2][3] = {\n{1.0f, .5f, 2e-1f},\n{1.0f, 2.0f, 3.0f},\n};\n"
+    )
     return [*found, *(folder / name for name in ("a.npz", "b.npz", "a.npy", "m.json", "a.exr", "sh.txt", "t.h"))]
 
 
@@ -302,9 +349,9 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
         if action == 0:
             del out[at:]
         elif action == 1:
-            out[at:at + 1] = rng.randbytes(1)
+            out[at : at + 1] = rng.randbytes(1)
         elif action == 2:
-            out[at:at + 4] = struct.pack("<I", rng.choice((0, 1, 255, 1 << 16, 1 << 31, (1 << 32) - 1, len(out))))
+            out[at : at + 4] = struct.pack("<I", rng.choice((0, 1, 255, 1 << 16, 1 << 31, (1 << 32) - 1, len(out))))
         else:
             out[at:at] = rng.randbytes(rng.randrange(1, 9))
     return bytes(out)
@@ -397,7 +444,7 @@ def test_a_header_of_numpy_allocates_nothing(tmp_path):
     np.savez_compressed(tmp_path / "c.npz", a=np.zeros(10))
     data = bytearray((tmp_path / "c.npz").read_bytes())
     at = data.index(b"PK\1\2")
-    data[at + 24:at + 28] = struct.pack("<I", 0xFFFFFFF0)
+    data[at + 24 : at + 28] = struct.pack("<I", 0xFFFFFFF0)
     (tmp_path / "c.npz").write_bytes(data)
     with pytest.raises(InputError, match="more than its bytes can"):
         read_npz(tmp_path / "c.npz")
@@ -410,10 +457,24 @@ def test_a_manifest_that_says_anything_at_all_breaks_nothing(tmp_path):
     (tmp_path / "bevy").mkdir()
     path = tmp_path / "bevy" / "day.dds"
     write_texture(path, encode("rgba16f", levels()[:2], cube=True).texture)
-    entry = {"sha256": digest_file(path), "bytes": 1, "holds": "specular", "format": "rgba16f", "scale": "radiance",
-             "levels": [{"size": 8, "roughness": 0.0, "error": 1e-4}, {"size": 4, "roughness": 1.0, "error": 1e-4}]}
-    whole = {"whitefurnace": "1", "name": "day", "key": "k", "device": {"name": "d"}, "recipe": {"size": 8, "fit": [1]},
-             "sh": {"coefficients": np.zeros((9, 3)).tolist()}, "files": {"bevy/day.dds": entry}, "kept": {}}
+    entry = {
+        "sha256": digest_file(path),
+        "bytes": 1,
+        "holds": "specular",
+        "format": "rgba16f",
+        "scale": "radiance",
+        "levels": [{"size": 8, "roughness": 0.0, "error": 1e-4}, {"size": 4, "roughness": 1.0, "error": 1e-4}],
+    }
+    whole = {
+        "whitefurnace": "1",
+        "name": "day",
+        "key": "k",
+        "device": {"name": "d"},
+        "recipe": {"size": 8, "fit": [1]},
+        "sh": {"coefficients": np.zeros((9, 3)).tolist()},
+        "files": {"bevy/day.dds": entry},
+        "kept": {},
+    }
 
     def places(node, at=()):
         for key in node if isinstance(node, dict) else range(len(node)):

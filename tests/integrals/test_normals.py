@@ -1,4 +1,5 @@
 """Normals drawn from every NDF follow D(m)(n·m): chi² over (energy, azimuth) bins, and the density of a table."""
+
 from __future__ import annotations
 
 import math
@@ -16,10 +17,15 @@ from whitefurnace.opencl.device import Device
 
 COUNT, RINGS, SECTORS = 200_000, 40, 8
 
-CASES = [(entry, dict(zip((p.name for p in entry.parameters), values, strict=True)))
-         for entry in models("ndf").values()
-         for values in {tuple(p.typical[0] for p in entry.parameters), tuple(p.typical[-1] for p in entry.parameters),
-                        tuple(p.typical[len(p.typical) // 2] for p in entry.parameters)}]
+CASES = [
+    (entry, dict(zip((p.name for p in entry.parameters), values, strict=True)))
+    for entry in models("ndf").values()
+    for values in {
+        tuple(p.typical[0] for p in entry.parameters),
+        tuple(p.typical[-1] for p in entry.parameters),
+        tuple(p.typical[len(p.typical) // 2] for p in entry.parameters),
+    }
+]
 # One family-wise level for all: a right sampler fails one run of this file in a hundred seeds, and the seed is fixed.
 LEVEL = 0.01 / len(CASES)
 
@@ -41,8 +47,9 @@ def energy_below(entry: Model, theta: np.ndarray, phi: np.ndarray, own: dict[str
 
 
 @pytest.mark.few(9)
-@pytest.mark.parametrize("entry, own", CASES, ids=lambda v: v.name if isinstance(v, Model) else
-                         ",".join(f"{k}={x:g}" for k, x in v.items()))
+@pytest.mark.parametrize(
+    "entry, own", CASES, ids=lambda v: v.name if isinstance(v, Model) else ",".join(f"{k}={x:g}" for k, x in v.items())
+)
 def test_chi2(device: Device, entry: Model, own: dict[str, Any]) -> None:
     m = sample(entry, COUNT, seed=7, device=device, precision=64 if device.fp64 else 32, **own)
     assert np.isfinite(m).all() and (m[:, 2] >= 0).all()
@@ -60,8 +67,10 @@ def test_chi2(device: Device, entry: Model, own: dict[str, Any]) -> None:
 
 def test_a_user_s_ndf_is_sampled_by_its_table(device: Device, tmp_path: Path) -> None:
     file = tmp_path / "lobe.clh"
-    file.write_text("real ndf_lobe_D(real cos_m, real sin2_m, real alpha) {\n"
-                    "  real t = alpha * alpha + (1 - alpha) * (1 + alpha) * sin2_m;\n  return 3 / (t * t);\n}\n")
+    file.write_text(
+        "real ndf_lobe_D(real cos_m, real sin2_m, real alpha) {\n"
+        "  real t = alpha * alpha + (1 - alpha) * (1 + alpha) * sin2_m;\n  return 3 / (t * t);\n}\n"
+    )
     m = sample(f"{file}:alpha=.2", COUNT, seed=3, device=device)
     tan2 = (1 - m[:, 2] ** 2) / m[:, 2] ** 2
     u = tan2 / (tan2 + 0.2**2)  # GGX's energy below tan²θ [Walter2007, eq. 35]
@@ -73,9 +82,15 @@ def test_the_seed_decides(device: Device) -> None:
     assert (a == b).all() and not (a == c).all()
 
 
-@pytest.mark.parametrize("arguments, message", [
-    ({}, "needs alpha"), ({"alpha": 2}, "outside"), ({"alpha": 0.1, "apha": 1}, "did you mean 'alpha'"),
-    ({"alpha": [0.1, 0.2]}, "one number")])
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ({}, "needs alpha"),
+        ({"alpha": 2}, "outside"),
+        ({"alpha": 0.1, "apha": 1}, "did you mean 'alpha'"),
+        ({"alpha": [0.1, 0.2]}, "one number"),
+    ],
+)
 def test_bad_input(device: Device, arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         sample("ggx", 10, device=device, **arguments)

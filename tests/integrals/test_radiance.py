@@ -1,4 +1,5 @@
 """Reflected radiance of lights and environments: closed forms, albedos, limits and brute force in numpy."""
+
 from __future__ import annotations
 
 import math
@@ -33,8 +34,9 @@ def radiance(device: Device) -> Any:
     return run
 
 
-def brdf(to: np.ndarray, v: np.ndarray, *, ndf: str = "ggx", masking: str = "smith", f0: float | None = None,
-         **own: Any) -> np.ndarray:
+def brdf(
+    to: np.ndarray, v: np.ndarray, *, ndf: str = "ggx", masking: str = "smith", f0: float | None = None, **own: Any
+) -> np.ndarray:
     """f(l, v) from the float64 references, by angles: another form than the kernel's."""
     lobe = model("ndf", ndf)
     h = (to + v) / np.linalg.norm(to + v, axis=-1, keepdims=True)
@@ -99,8 +101,19 @@ def test_a_white_lambertian_facing_a_punctual_light_returns_its_colour(radiance:
 def test_a_punctual_light_is_the_brdf_times_pi_and_colour(radiance: Any) -> None:
     alpha = np.array([1e-3, 0.05, 0.4, 1.0])
     NoL, phi_l, NoV, phi = 0.35, 2.8, 0.4, -0.2
-    found = radiance(light="punctual", ndf="ggx", fresnel="schlick", f0=0.04, alpha=alpha, NoL=NoL, phi_l=phi_l,
-                     color=3, NoV=NoV, phi=phi, precision=64)
+    found = radiance(
+        light="punctual",
+        ndf="ggx",
+        fresnel="schlick",
+        f0=0.04,
+        alpha=alpha,
+        NoL=NoL,
+        phi_l=phi_l,
+        color=3,
+        NoV=NoV,
+        phi=phi,
+        precision=64,
+    )
     wanted = [math.pi * 3 * NoL * brdf(direction(NoL, phi_l), direction(NoV, phi), f0=0.04, alpha=a) for a in alpha]
     assert np.allclose(found.values, wanted, rtol=1e-11, atol=0)
 
@@ -130,19 +143,24 @@ def test_ambient_light_is_the_directional_albedo(radiance: Any, device: Device, 
 
 
 @PRECISIONS
-@pytest.mark.parametrize("center, u, v", [
-    ((0, 0, 1), (1, 0, 0), (0, -1, 0)),
-    ((0.3, -2, 1), (0.2, 0.5, 0), (0, 0.3, 0.5)),
-    ((2, 1, 0.6), (0.0, 0.5, 0.1), (-0.2, 0.0, 0.5)),
-    ((0, 0, 1e-3), (1e3, 0, 0), (0, -1e3, 0)),
-])
-def test_lambert_under_a_rectangle_is_lamberts_formula(radiance: Any, precision: int, center: Any, u: Any,
-                                                       v: Any) -> None:
+@pytest.mark.parametrize(
+    "center, u, v",
+    [
+        ((0, 0, 1), (1, 0, 0), (0, -1, 0)),
+        ((0.3, -2, 1), (0.2, 0.5, 0), (0, 0.3, 0.5)),
+        ((2, 1, 0.6), (0.0, 0.5, 0.1), (-0.2, 0.0, 0.5)),
+        ((0, 0, 1e-3), (1e3, 0, 0), (0, -1e3, 0)),
+    ],
+)
+def test_lambert_under_a_rectangle_is_lamberts_formula(
+    radiance: Any, precision: int, center: Any, u: Any, v: Any
+) -> None:
     c, u, v = (np.array(x, float) for x in (center, u, v))
     if np.cross(u, v) @ c > 0:
         v = -v
-    found = radiance(light="rectangle", diffuse="lambert", albedo=1, NoV=0.5, precision=precision,
-                     **keywords(c, u=u, v=v))
+    found = radiance(
+        light="rectangle", diffuse="lambert", albedo=1, NoV=0.5, precision=precision, **keywords(c, u=u, v=v)
+    )
     wanted = lambert_polygon(np.array([c - u - v, c + u - v, c + u + v, c - u + v]))
     assert abs(found.values - wanted) <= found.error <= (3e-6 if precision == 32 else 1e-12)
 
@@ -156,8 +174,9 @@ def test_lambert_under_a_rectangle_that_sets(radiance: Any, precision: int) -> N
     for a, b in ((corners[1], corners[2]), (corners[0], corners[3])):
         up.insert(2, a + (b - a) * a[2] / (a[2] - b[2]))
     clipped = np.array([corners[0], corners[1], up[3], up[2]])
-    found = radiance(light="rectangle", diffuse="lambert", albedo=1, NoV=0.5, precision=precision,
-                     **keywords(c, u=u, v=v))
+    found = radiance(
+        light="rectangle", diffuse="lambert", albedo=1, NoV=0.5, precision=precision, **keywords(c, u=u, v=v)
+    )
     assert abs(found.values - lambert_polygon(clipped)) <= found.error
 
 
@@ -166,8 +185,17 @@ def test_lambert_under_a_disc_is_the_closed_form(radiance: Any, precision: int) 
     """Overhead, R²/(R² + d²); and wherever a disc faces the surface along any direction at angle θ above the horizon,
     parallel to it: ½(1 - (d² + x² - R²)/√((d² + x² + R²)² - 4 x² R²)) for an offset x."""
     x, R = np.array([0.0, 0.5, 3.0]), 1.3
-    found = radiance(light="disc", diffuse="lambert", albedo=1, NoV=0.5, center_x=x, center_y=0, center_z=1, radius=R,
-                     precision=precision)
+    found = radiance(
+        light="disc",
+        diffuse="lambert",
+        albedo=1,
+        NoV=0.5,
+        center_x=x,
+        center_y=0,
+        center_z=1,
+        radius=R,
+        precision=precision,
+    )
     wanted = (1 - (1 + x**2 - R**2) / np.sqrt((1 + x**2 + R**2) ** 2 - 4 * x**2 * R**2)) / 2
     assert np.abs(found.values - wanted).max() <= found.error <= (3e-6 if precision == 32 else 1e-12)
 
@@ -175,8 +203,20 @@ def test_lambert_under_a_disc_is_the_closed_form(radiance: Any, precision: int) 
 def test_a_disc_half_below_the_horizon_gives_half_of_what_is_known(radiance: Any) -> None:
     """A disc of angle σ on the horizon facing the origin: E/π = (σ - sin σ cos σ)/π."""
     sigma = np.array([0.1, 0.8, 1.4])
-    found = radiance(light="disc", diffuse="lambert", albedo=1, NoV=0.5, center_x=1, center_y=0, center_z=0,
-                     normal_x=-1, normal_y=0, normal_z=0, radius=np.tan(sigma), precision=64)
+    found = radiance(
+        light="disc",
+        diffuse="lambert",
+        albedo=1,
+        NoV=0.5,
+        center_x=1,
+        center_y=0,
+        center_z=0,
+        normal_x=-1,
+        normal_y=0,
+        normal_z=0,
+        radius=np.tan(sigma),
+        precision=64,
+    )
     assert np.abs(found.values - (sigma - np.sin(sigma) * np.cos(sigma)) / math.pi).max() <= found.error < 1e-11
 
 
@@ -190,23 +230,45 @@ def test_a_small_light_is_punctual(radiance: Any, shape: str) -> None:
         area, form = math.pi * size**2, {**keywords(to, normal=-to), "radius": size}
     else:
         area, form = 4 * float(np.linalg.norm(np.cross(edges["u"], edges["v"]))), keywords(to, **edges)
-    rest: dict[str, Any] = {"ndf": "ggx", "alpha": 0.3, "diffuse": "lambert", "albedo": 0.5, "NoV": 0.7,
-                            "precision": 64}
+    rest: dict[str, Any] = {
+        "ndf": "ggx",
+        "alpha": 0.3,
+        "diffuse": "lambert",
+        "albedo": 0.5,
+        "NoV": 0.7,
+        "precision": 64,
+    }
     found = radiance(light=shape, radiance=1 / area, **form, **rest)
     point = radiance(light="punctual", NoL=0.6, phi_l=2.5, color=1 / math.pi, **rest)
     assert abs(found.values / point.values - 1) < 1e-6
 
 
-@pytest.mark.parametrize("ndf, own", [("ggx", {"alpha": 0.3}), ("ggx", {"alpha": 0.05}), ("beckmann", {"alpha": 0.2}),
-                                      ("ggx_anisotropic", {"alpha_x": 0.1, "alpha_y": 0.4})])
+@pytest.mark.parametrize(
+    "ndf, own",
+    [
+        ("ggx", {"alpha": 0.3}),
+        ("ggx", {"alpha": 0.05}),
+        ("beckmann", {"alpha": 0.2}),
+        ("ggx_anisotropic", {"alpha_x": 0.1, "alpha_y": 0.4}),
+    ],
+)
 @pytest.mark.parametrize("NoV", [0.1, 0.6, 1.0])
 def test_lobes_under_a_rectangle_are_brute_force(radiance: Any, ndf: str, own: dict[str, float], NoV: float) -> None:
     c, u, v = np.array([-0.4, 0.2, 1.0]), np.array([0.5, 0.1, 0.0]), np.array([0.1, -0.6, 0.2])
     view = direction(NoV, 0.3)
     wanted = over_rectangle(lambda to: brdf(to, view, ndf=ndf, f0=0.04, **own), c, u, v)
     for precision in (32, 64):
-        found = radiance(light="rectangle", ndf=ndf, fresnel="schlick", f0=0.04, NoV=NoV, phi=0.3, precision=precision,
-                         **own, **keywords(c, u=u, v=v))
+        found = radiance(
+            light="rectangle",
+            ndf=ndf,
+            fresnel="schlick",
+            f0=0.04,
+            NoV=NoV,
+            phi=0.3,
+            precision=precision,
+            **own,
+            **keywords(c, u=u, v=v),
+        )
         assert abs(found.values - wanted) <= found.error + 1e-12, (found.values - wanted, found.error)
         assert found.error <= (5e-6 if precision == 32 else 1e-11)
 
@@ -243,8 +305,9 @@ def test_a_light_is_the_sum_of_its_parts(radiance: Any, precision: int, ndf: str
     v[(np.cross(u, v) * center).sum(1) > 0] *= -1
 
     def lit(c: np.ndarray, u: np.ndarray, v: np.ndarray) -> Integrated:
-        form = {f"{name}_{axis}": x[:, k] for name, x in (("center", c), ("u", u), ("v", v))
-                for k, axis in enumerate("xyz")}
+        form = {
+            f"{name}_{axis}": x[:, k] for name, x in (("center", c), ("u", u), ("v", v)) for k, axis in enumerate("xyz")
+        }
         return radiance(light="rectangle", ndf=ndf, alpha=alpha, NoV=NoV, phi=phi, precision=precision, **form)
 
     whole = lit(center, u, v)
@@ -258,16 +321,18 @@ def test_a_light_is_the_sum_of_its_parts(radiance: Any, precision: int, ndf: str
 def test_a_light_over_the_whole_sky_is_ambient(radiance: Any, device: Device) -> None:
     alpha = np.array([1e-3, 0.03, 0.3, 1.0])
     albedo = integrate("albedo", ndf="ggx", alpha=alpha, NoV=0.4, precision=64, device=device)
-    found = radiance(light="disc", center_x=0, center_y=0, center_z=1e-6, radius=1e6, ndf="ggx", alpha=alpha, NoV=0.4,
-                     precision=64)
+    found = radiance(
+        light="disc", center_x=0, center_y=0, center_z=1e-6, radius=1e6, ndf="ggx", alpha=alpha, NoV=0.4, precision=64
+    )
     assert np.abs(found.values - albedo.values).max() <= found.error + albedo.error + 1e-11
 
 
 def test_a_tabulated_area_serves_lights(radiance: Any) -> None:
     """Phong has no closed area: whole and parts, and the punctual limit."""
     rest: dict[str, Any] = {"ndf": "phong", "exponent": 50, "NoV": 0.5, "phi": math.pi, "precision": 64}
-    found = radiance(light="disc", **{**OVERHEAD, "center_x": 1.5}, normal_x=-1.5, radius=1e-4,
-                     radiance=1e8 / math.pi * 3.25, **rest)
+    found = radiance(
+        light="disc", **{**OVERHEAD, "center_x": 1.5}, normal_x=-1.5, radius=1e-4, radiance=1e8 / math.pi * 3.25, **rest
+    )
     NoL = 1 / math.sqrt(3.25)
     point = radiance(light="punctual", NoL=NoL, color=1 / math.pi, **rest)
     assert abs(found.values / point.values - 1) < 1e-6
@@ -275,8 +340,10 @@ def test_a_tabulated_area_serves_lights(radiance: Any) -> None:
 
 def test_a_users_brdf_under_a_light_has_rgb(radiance: Any, tmp_path: Any) -> None:
     path = tmp_path / "tinted.clh"
-    path.write_text("real3 brdf_tinted_f(real3 l, real3 v, real k) "
-                    "{ const real f = k / PI; const real3 r = {f, f / 2, f / 4}; return r; }\n")
+    path.write_text(
+        "real3 brdf_tinted_f(real3 l, real3 v, real k) "
+        "{ const real f = k / PI; const real3 r = {f, f / 2, f / 4}; return r; }\n"
+    )
     white = radiance(light="rectangle", diffuse="lambert", albedo=0.5, NoV=[0.2, 0.9], **SQUARE)
     found = radiance(light="rectangle", brdf=str(path), k=0.5, NoV=[0.2, 0.9], **SQUARE)
     assert found.values.shape == (2, 3)
@@ -308,8 +375,9 @@ def test_the_kernels_of_lights_are_their_references(device: Device, name: str, p
     to = to.reshape(3, -1)
     own = {p.name: np.full(to.shape[1], p.typical[0]) for p in entry.parameters}
     function = entry.provides[0]
-    found = evaluate(device, function, {"light": entry}, np.concatenate([to, *(v[None] for v in own.values())]),
-                     precision)[0]
+    found = evaluate(
+        device, function, {"light": entry}, np.concatenate([to, *(v[None] for v in own.values())]), precision
+    )[0]
     wanted = entry.reference[FUNCTIONS[function].ending](to.T, **own)
     assert np.isfinite(found).all() and (wanted > 0).any()
     assert np.abs(found - wanted).max() < (1e-6 if precision == 32 else 1e-14)
@@ -325,12 +393,15 @@ def test_the_specular_brdf_is_reciprocal(device: Device, ndf: str, masking: str)
     to, v = (direction(rng.uniform(0.01, 1, n), rng.uniform(0, 6.28, n)) for _ in range(2))
     part = engine.Part(device, integral("albedo"), slots, precision)
     own = {p.name: p.typical[len(p.typical) // 2] for m in slots.values() for p in m.parameters}
-    rows = np.stack([*(np.ones(n) for _ in part.view), *(np.full(n, own[p.name]) for m in slots.values()
-                                                         for p in m.parameters)])
+    rows = np.stack(
+        [*(np.ones(n) for _ in part.view), *(np.full(n, own[p.name]) for m in slots.values() for p in m.parameters)]
+    )
     numbers, terms, _ = part.cells(rows, precision)
-    numbers = numbers[len(part.view):]
-    there, back = (evaluate(device, "SPECULAR_F", slots, np.concatenate([a.T, b.T, numbers]), precision, terms)[0]
-                   for a, b in ((to, v), (v, to)))
+    numbers = numbers[len(part.view) :]
+    there, back = (
+        evaluate(device, "SPECULAR_F", slots, np.concatenate([a.T, b.T, numbers]), precision, terms)[0]
+        for a, b in ((to, v), (v, to))
+    )
     assert np.allclose(there, back, rtol=1e-12 if device.fp64 else 1e-5, atol=0) and there.max() > 0
     if "area" in slots["ndf"].reference and masking == "smith":
         f0 = own.pop("f0")
@@ -376,8 +447,9 @@ def test_a_constant_environment_is_the_albedo(radiance: Any, device: Device, pre
 
 @PRECISIONS
 @pytest.mark.parametrize("cube", [False, True])
-def test_a_white_sky_over_a_black_ground_is_the_albedo_too(radiance: Any, device: Device, precision: int,
-                                                           cube: bool) -> None:
+def test_a_white_sky_over_a_black_ground_is_the_albedo_too(
+    radiance: Any, device: Device, precision: int, cube: bool
+) -> None:
     """With no least radiance to take away: all of it over nodes, sharp lobes too."""
     sky = np.zeros((6, 4, 4, 3) if cube else (4, 8, 3), np.float32)
     if cube:
@@ -394,22 +466,30 @@ def test_a_white_sky_over_a_black_ground_is_the_albedo_too(radiance: Any, device
 
 
 @pytest.mark.few(1)
-@pytest.mark.parametrize("ndf, own, nodes", [("ggx", {"alpha": 0.4}, 60), ("ggx", {"alpha": 0.02}, 700),
-                                             ("ggx_anisotropic", {"alpha_x": 0.1, "alpha_y": 0.4}, 160)])
+@pytest.mark.parametrize(
+    "ndf, own, nodes",
+    [
+        ("ggx", {"alpha": 0.4}, 60),
+        ("ggx", {"alpha": 0.02}, 700),
+        ("ggx_anisotropic", {"alpha_x": 0.1, "alpha_y": 0.4}, 160),
+    ],
+)
 def test_lobes_in_an_environment_are_brute_force(radiance: Any, ndf: str, own: dict[str, float], nodes: int) -> None:
     sky, view = random_sky(), direction(0.6, 0.7)
     wanted = over_texels(sky, lambda to: brdf(to, view, ndf=ndf, f0=0.04, **own), frame_of((0, 1, 0)), nodes)
     for precision in (32, 64):
-        found = radiance(environment=sky, ndf=ndf, fresnel="schlick", f0=0.04, NoV=0.6, phi=0.7, precision=precision,
-                         **own)
+        found = radiance(
+            environment=sky, ndf=ndf, fresnel="schlick", f0=0.04, NoV=0.6, phi=0.7, precision=precision, **own
+        )
         assert np.abs(found.values - wanted).max() <= found.error + 1e-9, (found.values - wanted, found.error)
         assert found.error < 2e-5
 
 
 @pytest.mark.few(2)
 @pytest.mark.parametrize("ndf, alpha, NoV", [("ggx", 0.017, 0.001), ("beckmann", 0.044, 0.001), ("ggx", 0.025, 0.02)])
-def test_grazing_views_are_promoted_where_float32_blurs_the_lobe(radiance: Any, ndf: str, alpha: float,
-                                                                 NoV: float) -> None:
+def test_grazing_views_are_promoted_where_float32_blurs_the_lobe(
+    radiance: Any, ndf: str, alpha: float, NoV: float
+) -> None:
     """A half vector l + v is short there: what float32 leaves of it is 1e-7/(n·v) of a radian."""
     sky = np.random.default_rng(4).uniform(0, 1, (16, 32, 3)).astype(np.float32) ** 8
     rest: dict[str, Any] = {"environment": sky, "ndf": ndf, "alpha": alpha, "NoV": NoV, "normal": (0.3, 1, 0.2)}
@@ -425,8 +505,9 @@ def test_a_tilted_surface_and_the_sum_of_lobes(radiance: Any) -> None:
     def f(to: np.ndarray) -> np.ndarray:
         return brdf(to, view, alpha=0.5) + 0.3 / math.pi
 
-    found = radiance(environment=sky, normal=normal, ndf="ggx", alpha=0.5, diffuse="lambert", albedo=0.3, NoV=0.5,
-                     phi=1.0)
+    found = radiance(
+        environment=sky, normal=normal, ndf="ggx", alpha=0.5, diffuse="lambert", albedo=0.3, NoV=0.5, phi=1.0
+    )
     assert np.abs(found.values - over_texels(sky, f, frame_of(normal), 200)).max() <= found.error + 1e-5
 
 
@@ -484,8 +565,7 @@ def test_a_mirror_shows_the_texel_times_fresnel(radiance: Any, cube: bool) -> No
 
 
 def test_a_mirror_under_a_light_shows_it(radiance: Any) -> None:
-    found = radiance(light="disc", **OVERHEAD, radius=0.5, radiance=3, fresnel="schlick", f0=0.04,
-                     NoV=[1.0, 0.95, 0.5])
+    found = radiance(light="disc", **OVERHEAD, radius=0.5, radiance=3, fresnel="schlick", f0=0.04, NoV=[1.0, 0.95, 0.5])
     F = 0.04 + 0.96 * (1 - np.array([1.0, 0.95, 0.5])) ** 5
     assert np.allclose(found.values, 3 * F * [1, 1, 0], rtol=1e-6)
 
@@ -506,19 +586,22 @@ def test_environments_keep_their_options(radiance: Any) -> None:
 # ---------------------------------------------------------------------------------------------- refusals
 
 
-@pytest.mark.parametrize("arguments, said", [
-    ({"ndf": "ggx"}, "either a light or an environment"),
-    ({"ndf": "ggx", "light": "ambient", "environment": np.ones((2, 4, 3))}, "either a light or an environment"),
-    ({"ndf": "ggx", "light": "punctul"}, "did you mean 'punctual'"),
-    ({"ndf": "ggx", "light": "punctual"}, "light punctual needs NoL"),
-    ({"ndf": "ggx", "light": "punctual", "NoL": 2}, r"NoL = 2 is outside \[-1, 1\]"),
-    ({"ndf": "ggx", "light": "ambient", "normal": (0, 1, 0)}, "normal is of an environment"),
-    ({"ndf": "ggx", "environment": np.ones((2, 4, 3)), "normal": (0, 0, 0)}, "three numbers that are not all 0"),
-    ({"ndf": "ggx", "environment": np.ones((2, 4, 3)), "color": 1}, "no parameter 'color'"),
-    ({"ndf": "ggx", "light": "disc", **OVERHEAD, "radius": 1, "normal_z": 0}, "normal is 0"),
-    ({"ndf": "ggx", "light": "rectangle", **SQUARE, "v_x": 1, "v_y": 0}, "parallel or 0"),
-    ({"ndf": "ggx", "light": "ambient", "tolerance": 2}, r"outside \(0, 1\)"),
-])
+@pytest.mark.parametrize(
+    "arguments, said",
+    [
+        ({"ndf": "ggx"}, "either a light or an environment"),
+        ({"ndf": "ggx", "light": "ambient", "environment": np.ones((2, 4, 3))}, "either a light or an environment"),
+        ({"ndf": "ggx", "light": "punctul"}, "did you mean 'punctual'"),
+        ({"ndf": "ggx", "light": "punctual"}, "light punctual needs NoL"),
+        ({"ndf": "ggx", "light": "punctual", "NoL": 2}, r"NoL = 2 is outside \[-1, 1\]"),
+        ({"ndf": "ggx", "light": "ambient", "normal": (0, 1, 0)}, "normal is of an environment"),
+        ({"ndf": "ggx", "environment": np.ones((2, 4, 3)), "normal": (0, 0, 0)}, "three numbers that are not all 0"),
+        ({"ndf": "ggx", "environment": np.ones((2, 4, 3)), "color": 1}, "no parameter 'color'"),
+        ({"ndf": "ggx", "light": "disc", **OVERHEAD, "radius": 1, "normal_z": 0}, "normal is 0"),
+        ({"ndf": "ggx", "light": "rectangle", **SQUARE, "v_x": 1, "v_y": 0}, "parallel or 0"),
+        ({"ndf": "ggx", "light": "ambient", "tolerance": 2}, r"outside \(0, 1\)"),
+    ],
+)
 def test_bad_input_is_one_sentence(radiance: Any, arguments: dict[str, Any], said: str) -> None:
     with pytest.raises(UsageError, match=said):
         radiance(NoV=0.5, alpha=0.3, **arguments)

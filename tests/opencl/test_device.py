@@ -1,4 +1,5 @@
 """Devices: only those that give right answers are chosen, and what runs on them is what was asked for."""
+
 from __future__ import annotations
 
 import os
@@ -81,12 +82,15 @@ def test_no_opencl_at_all(fresh, monkeypatch):
         choose_device()
 
 
-@pytest.mark.parametrize("spoil, verdict", [
-    (lambda text: text.replace("sqrt(v", "sqrt(v + (SCALAR)1.0e-3"), "wrong answer"),
-    (lambda text: text.replace("sum > (real)(bend)", "sum < (real)(bend)"), "wrong answer"),
-    (lambda text: text.replace("fma(", "no_such_function("), "no_such_function"),
-    (lambda text: text.replace("void probe", "void prove"), "probe"),
-])
+@pytest.mark.parametrize(
+    "spoil, verdict",
+    [
+        (lambda text: text.replace("sqrt(v", "sqrt(v + (SCALAR)1.0e-3"), "wrong answer"),
+        (lambda text: text.replace("sum > (real)(bend)", "sum < (real)(bend)"), "wrong answer"),
+        (lambda text: text.replace("fma(", "no_such_function("), "no_such_function"),
+        (lambda text: text.replace("void probe", "void prove"), "probe"),
+    ],
+)
 def test_a_device_that_fails_the_probe_is_refused_with_the_reason(fresh, monkeypatch, capfd, spoil, verdict):
     spoilt = spoil(devices._probe_text())
     assert spoilt != devices._probe_text()
@@ -137,13 +141,20 @@ def test_the_user_s_own_vendors_are_left_alone(monkeypatch, tmp_path):
 
 
 def test_a_home_that_cannot_be_written(tmp_path):
-    code = ("from whitefurnace.opencl.device import choose_device; import os;"
-            "choose_device(); print(os.environ['XDG_CACHE_HOME'])")
+    code = (
+        "from whitefurnace.opencl.device import choose_device; import os;"
+        "choose_device(); print(os.environ['XDG_CACHE_HOME'])"
+    )
     blocked = tmp_path / "file"
     blocked.write_text("")  # a file in the place of a folder stops root too
     environment = {key: value for key, value in os.environ.items() if key != "POCL_CACHE_DIR"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120,
-                          env=environment | {"XDG_CACHE_HOME": str(blocked / "cache")})
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment | {"XDG_CACHE_HOME": str(blocked / "cache")},
+    )
     assert (done.returncode, done.stderr) == (0, "")
     assert not Path(done.stdout.strip()).exists(), "the cache outlives the process"
 

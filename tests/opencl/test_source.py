@@ -1,5 +1,6 @@
 """Assembled kernel text: the tables of programs and of functions agree with the kernel files, and constants of the host
 reach the text."""
+
 from __future__ import annotations
 
 import re
@@ -32,8 +33,10 @@ def test_models_have_the_functions_that_they_provide(entry: Model) -> None:
         taken = [item.split() for item in found[1].split(",") if item.strip()]
         kinds = FUNCTIONS[function].kinds(entry.isotropic)
         if entry.slot in SELF_CONTAINED:
-            wanted = [*("real3" if kind is VECTOR else "real" for kind in kinds),
-                      *("real" for _ in entry.passed(function))]
+            wanted = [
+                *("real3" if kind is VECTOR else "real" for kind in kinds),
+                *("real" for _ in entry.passed(function)),
+            ]
             assert [words[0] for words in taken if words != ["void"]] == wanted, f"{name}({found[1]})"
 
 
@@ -54,19 +57,30 @@ def test_every_program_is_made_of_files_that_exist() -> None:
     assert there == used | generated
 
 
-@pytest.mark.parametrize(("constant", "programs"), [
-    ("ORDER", ("interpolation", "texels")), ("BEYOND", ("interpolation", "texels")), ("PATCH", ("texels",)),
-    ("TAPS", ("texels",)), ("RUN", ("octahedral",)), ("TILE", ("octahedral",)), ("RUN_EDGE", ("octahedral",)),
-    ("TILE_EDGE", ("octahedral",)),
-])
-def test_a_constant_of_the_host_is_the_kernels(constant: str, programs: tuple[str, ...],
-                                               monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("constant", "programs"),
+    [
+        ("ORDER", ("interpolation", "texels")),
+        ("BEYOND", ("interpolation", "texels")),
+        ("PATCH", ("texels",)),
+        ("TAPS", ("texels",)),
+        ("RUN", ("octahedral",)),
+        ("TILE", ("octahedral",)),
+        ("RUN_EDGE", ("octahedral",)),
+        ("TILE_EDGE", ("octahedral",)),
+    ],
+)
+def test_a_constant_of_the_host_is_the_kernels(
+    constant: str, programs: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A changed constant changes the text of every program that uses it, and no kernel file states it."""
 
     def texts() -> dict[str, source.Source]:
         row = {"interpolation": "interpolation", "octahedral": "convolution by the symmetries of the cube"}
-        return {name: source.assembled(row[name]) if name in row else
-                source.assembled("nodes and harmonics", kind="cube") for name in programs}
+        return {
+            name: source.assembled(row[name]) if name in row else source.assembled("nodes and harmonics", kind="cube")
+            for name in programs
+        }
 
     before, digest = texts(), source.everything.__wrapped__()
     value = getattr(constants, constant)
@@ -78,8 +92,13 @@ def test_a_constant_of_the_host_is_the_kernels(constant: str, programs: tuple[st
         assert found.text != before[name].text and found.digest != before[name].digest
     assert source.everything.__wrapped__() != digest
     piece = "<classes>" if programs == ("octahedral",) else "<grid>"
-    used = {file for row in source.PROGRAMS.values() if piece in row.pieces for file in row.pieces
-            if not re.search("[<{]", file)}
+    used = {
+        file
+        for row in source.PROGRAMS.values()
+        if piece in row.pieces
+        for file in row.pieces
+        if not re.search("[<{]", file)
+    }
     for file in used:
         assert not re.search(rf"#define {constant}\b", text_of(file)), file
 

@@ -1,5 +1,6 @@
 """Certificates: their order statistic against the binomial distribution, and how often what they state holds, against
 the errors of all texels."""
+
 from __future__ import annotations
 
 import functools
@@ -73,7 +74,9 @@ def test_a_statement_by_hand() -> None:
     many = np.concatenate([np.arange(1, 472), [5000, 9000]]) / 1e4
     one = np.ones((473, 3))
     assert statement(one + many[:, None], one, (np.arange(473), np.arange(0)), np.ones(473), 1.0, 6000)[:2] == (
-        pytest.approx(0.5), pytest.approx(0.9))
+        pytest.approx(0.5),
+        pytest.approx(0.9),
+    )
 
 
 # ------------------------------------------------------------------------------------------- how often it holds
@@ -86,8 +89,15 @@ def job_of(convolver: Convolver, alpha: float, shape: Shape, tolerance: float) -
     return Job(plan, lobe, shape)
 
 
-def kept(device: Device, texels: np.ndarray, alpha: float, shape: Shape, tolerance: float, runs: int,
-         truth: Callable[[Convolver, Job], np.ndarray]) -> tuple[int, list[tuple[float, float]]]:
+def kept(
+    device: Device,
+    texels: np.ndarray,
+    alpha: float,
+    shape: Shape,
+    tolerance: float,
+    runs: int,
+    truth: Callable[[Convolver, Job], np.ndarray],
+) -> tuple[int, list[tuple[float, float]]]:
     """In how many of `runs` certificates, each of its own draw, `error` is at least the 99th percentile of the errors
     of all texels; and (stated, true) of each."""
     env = environment(texels)
@@ -143,13 +153,14 @@ def picture(kind: str) -> np.ndarray:
     v, u = np.meshgrid((np.arange(256) + 0.5) / 256, (np.arange(512) + 0.5) / 512, indexing="ij")
     waves = sum(np.cos(2 * math.pi * (k * u + rng.random()))[..., None] * rng.random(3) / k for k in range(1, 24))
     texels = (1.5 + np.tanh(20 * (0.5 - v))[..., None] + 0.2 * waves * np.sin(math.pi * v)[..., None]) * rng.uniform(
-        0.8, 1.2, (256, 512, 3))
+        0.8, 1.2, (256, 512, 3)
+    )
     if kind == "sun":
         texels[70:72, 200:202] = 1e5 * texels.mean() / 4
     else:
         texels *= 0.02
         for row, column in ((60, 40), (90, 200), (100, 330), (30, 430)):
-            texels[row:row + 40, column:column + 60] = 20 * rng.random(3)
+            texels[row : row + 40, column : column + 60] = 20 * rng.random(3)
     return texels.astype(np.float32)
 
 
@@ -159,6 +170,7 @@ def picture(kind: str) -> np.ndarray:
 def test_what_is_stated_holds_at_real_sizes(device: Device, kind: str, alpha: float, size: int) -> None:
     """Against the plain sum over every texel (itself held to float64 quadrature in tests/test_prefilter_kernels.py),
     twice as finely cut as the plan's."""
+
     def truth(convolver: Convolver, job: Job) -> np.ndarray:
         finer = replace(job.plan, cuts=2 * max(job.plan.cuts, 2))
         assert job.lobe

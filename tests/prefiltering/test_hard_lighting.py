@@ -1,5 +1,6 @@
 """Levels of every kind of lobe over every kind of image, against float64 quadrature of the exact lobe over texels
 halved until they are small beside their distance: errors within what is stated, none large, and no seams."""
+
 from __future__ import annotations
 
 import functools
@@ -84,14 +85,20 @@ def picture(name: str) -> np.ndarray:
     return SOURCES[name]()
 
 
-def check(device: Device, ndf: str, source: str, path: Path, texels: int, rotate: float = 33.0,
-          **options: object) -> None:
+def check(
+    device: Device, ndf: str, source: str, path: Path, texels: int, rotate: float = 33.0, **options: object
+) -> None:
     """`texels` random ones of each level, and those nearest the brightest texel."""
     pixels = picture(source)
     if ndf == "mine":
         (path / "mine.clh").write_text(MINE)
-    chain = prefilter(pixels, ndf=str(path / "mine.clh") if ndf == "mine" else ndf, rotate=rotate, device=device,
-                      **{**CHAIN, **options})  # type: ignore[arg-type]
+    chain = prefilter(
+        pixels,
+        ndf=str(path / "mine.clh") if ndf == "mine" else ndf,
+        rotate=rotate,
+        device=device,
+        **{**CHAIN, **options},
+    )  # type: ignore[arg-type]
     assert (chain.error[1:] <= options.get("tolerance", 1e-3)).all(), (ndf, source, chain.error)
     rng = np.random.default_rng([len(ndf), *source.encode()])
     brightest = reference.texel_nodes(pixels, math.radians(rotate), 1)[0][pixels.reshape(-1, 3).max(1).argmax()]
@@ -105,13 +112,16 @@ def check(device: Device, ndf: str, source: str, path: Path, texels: int, rotate
         density = density_of(ndf, float(r))
         slope = float(density(np.array([2.0]))[0]) / norm_of(density)
         index = np.concatenate([drawn, near])
-        want = np.array([reference.graded_lobe(pixels, math.radians(rotate), d[m], density, float(r * r), slope)
-                         for m in index])
+        want = np.array(
+            [reference.graded_lobe(pixels, math.radians(rotate), d[m], density, float(r * r), slope) for m in index]
+        )
         mean = float((flat.sum(1) * np.tile(cube_solid_angles(size).ravel(), 6)).sum() / (12 * math.pi))
         error = texel_errors(flat[index], want, mean)
         over = int((error[:texels] > chain.error[k]).sum())
-        text = (f"{ndf}, {source}, level {k} at α = {r * r:.2g} ({chain.rule[k]}): {over} of {texels} over "
-                f"{chain.error[k]:.2g}, the largest {error.max():.2g}")
+        text = (
+            f"{ndf}, {source}, level {k} at α = {r * r:.2g} ({chain.rule[k]}): {over} of {texels} over "
+            f"{chain.error[k]:.2g}, the largest {error.max():.2g}"
+        )
         # Were the statement just right, 1 % of the texels would lie over it; 1e-4 is the chance of more by luck.
         assert over <= binom.isf(1e-4, texels, 0.01), text
         assert error.max() <= 1e-2, text
@@ -145,8 +155,9 @@ def test_every_ndf(device: Device, tmp_path: Path, ndf: str) -> None:
     check(device, ndf, "noise", tmp_path, 4, levels=4)
 
 
-@pytest.mark.parametrize("source", ["odd rows", "one texel a face", "checkerboard", "sun on an edge",
-                                    "sun at the pole"])
+@pytest.mark.parametrize(
+    "source", ["odd rows", "one texel a face", "checkerboard", "sun on an edge", "sun at the pole"]
+)
 def test_every_source(device: Device, tmp_path: Path, source: str) -> None:
     check(device, "ggx", source, tmp_path, 4, levels=4)
 

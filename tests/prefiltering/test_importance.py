@@ -1,4 +1,5 @@
 """Filtered importance sampling: exact where it must be, right on average where it samples, and nowhere shifted."""
+
 from __future__ import annotations
 
 import json
@@ -117,7 +118,7 @@ def test_the_pyramid_keeps_the_energy_of_every_level(device: Device, source: tup
     first = 0
     for k in range(size.bit_length()):
         n = size >> k
-        faces = read[first:first + 6 * (n + 2) ** 2].reshape(6, n + 2, n + 2, 4)[:, 1:-1, 1:-1, :3]
+        faces = read[first : first + 6 * (n + 2) ** 2].reshape(6, n + 2, n + 2, 4)[:, 1:-1, 1:-1, :3]
         mean = np.einsum("fijc,ij->c", faces.astype(np.float64), cube_solid_angles(n)) / (4 * math.pi) + own.base
         # Means in float32 through at most six levels; the reference's nodes of a lat-long texel leave 1e-7.
         assert np.abs(mean / want - 1).max() <= 1e-6, (k, mean, want)
@@ -163,8 +164,9 @@ def test_a_texel_read_at_its_centre_is_itself(device: Device, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("level", [0, 1, 2, 3])
-def test_a_sample_is_read_where_texels_are_as_large_as_it(device: Device, level: int,
-                                                          monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_sample_is_read_where_texels_are_as_large_as_it(
+    device: Device, level: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """At the middle of a face, between four texels, and at a corner, between three that are 3^(-3/2) as large."""
     texels, n = noise(6, 16, 16), 16 >> level
     weight = np.repeat(cube_solid_angles(16)[None, ..., None], 6, 0)
@@ -315,14 +317,19 @@ def test_levels_are_certified_as_any_other(device: Device) -> None:
     assert off.max() == pytest.approx(e.worst, rel=0.02, abs=2e-3)  # the other's own error is 1e-3
 
 
-@pytest.mark.parametrize("arguments, words", [
-    (("--samples", "0"), ("samples 0", "[1, 65536]")), (("--samples", "65537"), ("65537", "65536")),
-    (("--samples", "many"), ("many",)),
-    (("--samples", "64", "--tolerance", "1e-3"), ("samples", "tolerance", "not both")),
-    (("--samples", "64", "--quality", "draft"), ("samples", "quality", "not both")),
-])
-def test_the_command_line_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...],
-                                  words: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        (("--samples", "0"), ("samples 0", "[1, 65536]")),
+        (("--samples", "65537"), ("65537", "65536")),
+        (("--samples", "many"), ("many",)),
+        (("--samples", "64", "--tolerance", "1e-3"), ("samples", "tolerance", "not both")),
+        (("--samples", "64", "--quality", "draft"), ("samples", "quality", "not both")),
+    ],
+)
+def test_the_command_line_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], words: tuple[str, ...]
+) -> None:
     write_exr(tmp_path / "a.exr", noise(2, 4))
     with pytest.raises(SystemExit) as done:
         main(["bake", str(tmp_path / "a.exr"), "-o", str(tmp_path / "out"), *arguments])
@@ -341,8 +348,21 @@ def test_a_bake_by_samples(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -
     keys = []
     for count in ("32", "33"):
         with pytest.raises(SystemExit) as done:
-            main(["bake", str(tmp_path / "a.exr"), "-o", str(tmp_path / "out"), "--size", "16", "--min-size", "4",
-                  "--samples", count, "--quiet"])
+            main(
+                [
+                    "bake",
+                    str(tmp_path / "a.exr"),
+                    "-o",
+                    str(tmp_path / "out"),
+                    "--size",
+                    "16",
+                    "--min-size",
+                    "4",
+                    "--samples",
+                    count,
+                    "--quiet",
+                ]
+            )
         assert done.value.code == 0, capsys.readouterr().err
         manifest = json.loads((tmp_path / "out" / "a.json").read_text())
         keys.append(manifest["key"])

@@ -1,5 +1,6 @@
 """Hard inputs for the whole of a bake: panels with sharp edges, suns on cubes, radiance at the ends of float32,
 devices without float64, and whose files are whose."""
+
 from __future__ import annotations
 
 import tracemalloc
@@ -40,7 +41,7 @@ def test_a_sun_on_a_cube_needs_no_table_of_every_node():
     area = (w[:, None] * w * (1 + s[:, None] ** 2 + s**2) ** -1.5).sum()
     corner = [np.arctan2(a * b, np.sqrt(a * a + b * b + 1)) for a in (-1, -1 + 2 / 128) for b in (-1, -1 + 2 / 128)]
     assert area == pytest.approx(corner[0] - corner[1] - corner[2] + corner[3], rel=1e-10)
-    assert (columns[3 * 128 * 256:] == 1).all()
+    assert (columns[3 * 128 * 256 :] == 1).all()
 
 
 @pytest.mark.parametrize("radiance", [1e-40, 1e-30, 1.0, 3e38])
@@ -92,16 +93,25 @@ def test_levels_of_a_longer_chain_do_not_stay_beside_a_shorter_one(tmp_path, dev
     bake(env, tmp_path, for_="exr", size=32, min_size=8, device=device)
     bake(env, tmp_path, for_="exr", size=16, min_size=16, device=device)
     assert {p.name for p in (tmp_path / "exr").glob("array_specular_*")} == {
-        "array_specular_0.exr", "array_specular_0_latlong.exr"}
+        "array_specular_0.exr",
+        "array_specular_0_latlong.exr",
+    }
     bake(env, tmp_path, for_="exr", size=32, min_size=8, device=device)
     assert (tmp_path / "exr" / "array_specular_2.exr").exists()
 
 
 def test_an_environment_is_known_by_what_was_applied_to_it(tmp_path, device: Device):
     pixels = noise()
-    states = [bake(env, tmp_path, device=device, **SMALL)[0].state for env in (
-        environment(pixels), environment(pixels, rotate=90), environment(pixels, exposure=1), environment(pixels),
-        environment(pixels))]
+    states = [
+        bake(env, tmp_path, device=device, **SMALL)[0].state
+        for env in (
+            environment(pixels),
+            environment(pixels, rotate=90),
+            environment(pixels, exposure=1),
+            environment(pixels),
+            environment(pixels),
+        )
+    ]
     assert states == ["done", "done", "done", "done", "skipped"]
 
 

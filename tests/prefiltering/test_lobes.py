@@ -1,5 +1,6 @@
 """The series that stand for lobes, against the NDFs' own references; what lobes say of themselves, by other
 quadrature."""
+
 from __future__ import annotations
 
 import functools
@@ -65,8 +66,10 @@ def parameters_of(name: str, r: float) -> dict[str, float]:
 def catalogue_lobe(device: Device, name: str, r: float) -> tuple[Lobe, Callable[[np.ndarray], np.ndarray]]:
     """The lobe, and its D at q by the entry's reference in θ."""
     entry, parameters = models("ndf")[name], parameters_of(name, r)
-    return (ndf_lobe(device, chosen("ndf", entry), r, parameters),
-            lambda q: entry.reference["D"](np.arctan2(np.sqrt(q), np.sqrt(4 - q)), **parameters))
+    return (
+        ndf_lobe(device, chosen("ndf", entry), r, parameters),
+        lambda q: entry.reference["D"](np.arctan2(np.sqrt(q), np.sqrt(4 - q)), **parameters),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -157,15 +160,35 @@ def test_a_mixture_is_the_sum_of_its_parts(device: Device) -> None:
     parts = [(0.5, 0.2), (0.7, 0.6), (-0.2, 0.9), (0.0, 0.4)]
     lobe = mixture_lobe(device, recipe.ndf, parts, recipe.parameters)
     q, w = panels(0.0, 2.0)
-    want = np.sum([weight * density(q) / single.norm for weight, r in parts
-                   for single, density in [catalogue_lobe(device, "ggx", r)]], 0)
+    want = np.sum(
+        [
+            weight * density(q) / single.norm
+            for weight, r in parts
+            for single, density in [catalogue_lobe(device, "ggx", r)]
+        ],
+        0,
+    )
     np.testing.assert_allclose(lobe.density(q), want, rtol=1e-10, atol=1e-10)
     assert lobe.norm == 1 and float((want * (1 - q / 2) * w).sum()) == pytest.approx(1, rel=1e-8)
     assert len(lobe.summands) == 3  # that of weight 0 is none
     series = lobe.series(0.0, 2.0, 3e-7)
-    assert missed(series, lambda q: np.sum([
-        weight * density(q) / single.norm for weight, r in parts
-        for single, density in [catalogue_lobe(device, "ggx", r)]], 0), 0.0, 2.0, 1.0) <= 1.5 * 3e-7
+    assert (
+        missed(
+            series,
+            lambda q: np.sum(
+                [
+                    weight * density(q) / single.norm
+                    for weight, r in parts
+                    for single, density in [catalogue_lobe(device, "ggx", r)]
+                ],
+                0,
+            ),
+            0.0,
+            2.0,
+            1.0,
+        )
+        <= 1.5 * 3e-7
+    )
     assert lobe.alpha == pytest.approx(0.04) and lobe.reach == 2  # as sharp as its sharpest
 
 
@@ -182,8 +205,7 @@ class OneClass:
         self.moment = o.device.array(np.ones((8, 1, 18), o.kind))
 
 
-def on_device(o: Octahedral, lobe: Lobe, source: np.ndarray,
-              error: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def on_device(o: Octahedral, lobe: Lobe, source: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(q, K, ∑|K| over the mirror images) of one source for every reflection of the outputs of a cube: sums of
     `convolve_all`, transformed back."""
     (found,) = o.orbits(Shape(False, 32))
@@ -209,8 +231,11 @@ def test_series_on_a_device(device: Device, file: Path, name: str, precision: in
     o, epsilon, rng = Octahedral(device, precision), 2.0 ** (-24 if precision == 32 else -53), np.random.default_rng(5)
     (found,) = o.orbits(Shape(False, 32))
     for r in (0.03, 0.3, 1.0):
-        lobe = (ndf_lobe(device, chosen("ndf", file), r, {"alpha": r * r}) if name == "mine" else
-                catalogue_lobe(device, name, r)[0])
+        lobe = (
+            ndf_lobe(device, chosen("ndf", file), r, {"alpha": r * r})
+            if name == "mine"
+            else catalogue_lobe(device, name, r)[0]
+        )
         series = lobe.series(0.0, 2.0 if lobe.reach >= 1 else 1.25 * lobe.reach, 3e-7)
         k = np.arange(len(series.terms))
         for away in (0.0, 1e-4, 1e-3, 1e-2, 0.1):

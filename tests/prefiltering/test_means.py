@@ -1,5 +1,6 @@
 """Level 0 from lists that are made once for a pair of grids: their weights against areas found otherwise, symmetries,
 and images and grids that must not be mixed up."""
+
 from __future__ import annotations
 
 import math

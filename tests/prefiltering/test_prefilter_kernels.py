@@ -1,4 +1,5 @@
 """The anterpolated convolution and the exact sum over texels, against float64 quadrature and closed forms."""
+
 from __future__ import annotations
 
 import itertools
@@ -30,8 +31,15 @@ def noise(*shape: int) -> np.ndarray:
     return np.random.default_rng(list(shape)).random((*shape, 3), np.float32) + np.float32(0.1)
 
 
-def convolved(device: Device, texels: np.ndarray, lobe: Lobe, n: int, rotate: float = 0.0,
-              shape: Shape = WHERE, tolerance: float = 1e-5) -> np.ndarray:
+def convolved(
+    device: Device,
+    texels: np.ndarray,
+    lobe: Lobe,
+    n: int,
+    rotate: float = 0.0,
+    shape: Shape = WHERE,
+    tolerance: float = 1e-5,
+) -> np.ndarray:
     convolver = Convolver(device, environment(texels, rotate=rotate))
     return convolver.convolve(lobe, shape, n, tolerance).reshape(-1, 3) / convolver.scale
 
@@ -55,7 +63,8 @@ def assert_close(got: np.ndarray, want: np.ndarray, tolerance: float, context: o
     error = np.abs(got - want) / want
     at = np.unravel_index(error.argmax(), error.shape)
     assert np.isfinite(got).all() and error.max() <= tolerance, (
-        f"{context}: at {at} got {got[at]}, wanted {want[at]}, error {error.max():.2e} > {tolerance:.1e}")
+        f"{context}: at {at} got {got[at]}, wanted {want[at]}, error {error.max():.2e} > {tolerance:.1e}"
+    )
 
 
 # ---------------------------------------------------------------------------------------------- convergence
@@ -66,11 +75,16 @@ def assert_close(got: np.ndarray, want: np.ndarray, tolerance: float, context: o
 def test_anterpolation_has_its_order(device: Device, source: tuple[int, ...], alpha: float, n: int) -> None:
     texels = noise(*source)
     want = truth(texels, alpha, 8, 21.0)
-    errors = [float(np.sqrt(np.mean((convolved(device, texels, ggx(device, alpha), n << k, 21.0) / want - 1) ** 2)))
-              for k in range(3)]
+    errors = [
+        float(np.sqrt(np.mean((convolved(device, texels, ggx(device, alpha), n << k, 21.0) / want - 1) ** 2)))
+        for k in range(3)
+    ]
     nodes = [(n << k) - 2 * constants.BEYOND for k in range(3)]  # on a face
-    pairs = [(math.log(a / b) / math.log(y / x)) for (a, b), (x, y) in
-             zip(itertools.pairwise(errors), itertools.pairwise(nodes), strict=True) if b > 3e-7]  # float32 ends there
+    pairs = [
+        (math.log(a / b) / math.log(y / x))
+        for (a, b), (x, y) in zip(itertools.pairwise(errors), itertools.pairwise(nodes), strict=True)
+        if b > 3e-7
+    ]  # float32 ends there
     # RATE is what plans scale grids by; ORDER is the limit, which 2 nodes a lobe width are not. With stencils of 4
     # points no doubling falls faster than by the fourth power.
     assert pairs and plan.RATE - 1 <= max(pairs) <= constants.ORDER + 1, (alpha, source, errors, pairs)
@@ -96,8 +110,7 @@ def test_checkerboard(device: Device) -> None:
     texels = np.repeat((np.indices((64, 128)).sum(0) % 2)[..., None], 3, -1).astype(np.float32)
     alpha = 0.1
     got = convolved(device, texels, ggx(device, alpha), plan.grid_size(alpha, 1e-3))
-    assert_close(got, truth(texels, alpha, 4), 1e-3,
-                 "checkerboard")  # the plan's tolerance
+    assert_close(got, truth(texels, alpha, 4), 1e-3, "checkerboard")  # the plan's tolerance
 
 
 # ---------------------------------------------------------------------------------------------- the exact sum
@@ -112,8 +125,12 @@ def test_exact_sum(device: Device, source: tuple[int, ...], alpha: float, rotate
     size = source[1] if len(source) == 3 else source[0]
     cuts = max(8, 2 * math.ceil(2 * math.pi / size / alpha))  # 2-point cells of α/2: (1/4)^4/4320 of curvature
     kink = 0.05 * (math.pi / size / cuts) ** 2  # (n·l)₊ over a node's cell, of those at the horizon only
-    assert_close(exact(device, texels, ggx(device, alpha), cuts, rotate), truth(texels, alpha, cuts + 4, rotate),
-                 rounding(alpha) + kink, (source, alpha))
+    assert_close(
+        exact(device, texels, ggx(device, alpha), cuts, rotate),
+        truth(texels, alpha, cuts + 4, rotate),
+        rounding(alpha) + kink,
+        (source, alpha),
+    )
 
 
 @pytest.mark.parametrize("source", [(32, 64), (6, 16, 16)], ids=str)
@@ -144,8 +161,10 @@ def test_constant(device: Device, source: tuple[int, ...], alpha: float) -> None
     # 1 is what the design asks for; numerator and denominator of .7 round apart, by 6e-8 a sum and block of it.
     for level, tolerance in ((1.0, 1e-6), (0.7, 3e-6)):
         texels = np.full((*source, 3), level, np.float32)
-        for got in (convolved(device, texels, ggx(device, alpha), plan.grid_size(alpha, 1e-3), 10.0),
-                    exact(device, texels, ggx(device, alpha), 2 * math.ceil(8 / alpha / source[-1]), 10.0)):
+        for got in (
+            convolved(device, texels, ggx(device, alpha), plan.grid_size(alpha, 1e-3), 10.0),
+            exact(device, texels, ggx(device, alpha), 2 * math.ceil(8 / alpha / source[-1]), 10.0),
+        ):
             error = float(np.abs(got / np.float32(level) - 1).max())
             assert error <= tolerance, (source, alpha, level, error)
 
@@ -184,10 +203,14 @@ def test_lobe_norm(device: Device, name: str, r: float) -> None:
 
 
 @pytest.mark.parametrize("alpha", [0.02, 0.1, 0.5, 1.0])
-@pytest.mark.parametrize("source, at", [((32, 64), (11, 40)), ((32, 64), (0, 3)), ((17, 34), (16, 33)),
-                                        ((6, 16, 16), (2, 8, 3)), ((6, 5, 5), (4, 0, 4))], ids=str)
-def test_one_bright_texel_is_the_lobe(device: Device, source: tuple[int, ...], at: tuple[int, ...],
-                                      alpha: float) -> None:
+@pytest.mark.parametrize(
+    "source, at",
+    [((32, 64), (11, 40)), ((32, 64), (0, 3)), ((17, 34), (16, 33)), ((6, 16, 16), (2, 8, 3)), ((6, 5, 5), (4, 0, 4))],
+    ids=str,
+)
+def test_one_bright_texel_is_the_lobe(
+    device: Device, source: tuple[int, ...], at: tuple[int, ...], alpha: float
+) -> None:
     """L K over one texel by 24 x 24 Gauss nodes, over ∫K dω in closed form."""
     texels = np.zeros((*source, 3), np.float32)
     texels[at] = (1e4, 2e4, 5e3)
@@ -223,9 +246,17 @@ def latlong_harmonics(texels: np.ndarray) -> np.ndarray:
     # x = sin θ cos φ, y = cos θ, z = sin θ sin φ.
     k0, k1, k2 = math.sqrt(1 / (4 * math.pi)), math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
     k20, k22 = math.sqrt(5 / (16 * math.pi)), math.sqrt(15 / (16 * math.pi))
-    basis = [k0 * np.outer(one, p1), k1 * np.outer(cos1, p1), k1 * np.outer(plain, ps), k1 * np.outer(plain, pc),
-             k2 * np.outer(cross, pc), k2 * np.outer(cross, ps), k20 * (3 * np.outer(sin2, pss) - np.outer(one, p1)),
-             k2 * np.outer(sin2, pcs), k22 * (np.outer(sin2, pcc) - np.outer(cos2, p1))]
+    basis = [
+        k0 * np.outer(one, p1),
+        k1 * np.outer(cos1, p1),
+        k1 * np.outer(plain, ps),
+        k1 * np.outer(plain, pc),
+        k2 * np.outer(cross, pc),
+        k2 * np.outer(cross, ps),
+        k20 * (3 * np.outer(sin2, pss) - np.outer(one, p1)),
+        k2 * np.outer(sin2, pcs),
+        k22 * (np.outer(sin2, pcc) - np.outer(cos2, p1)),
+    ]
     return np.stack([np.einsum("ij,ijk->k", b, texels.astype(np.float64)) for b in basis])
 
 
@@ -233,8 +264,19 @@ def values_of_harmonics(d: np.ndarray) -> np.ndarray:
     """(9, N): the real basis at directions (N, 3), in the order and signs of design.md."""
     x, y, z = d.T
     k1, k2 = math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
-    return np.stack([np.full_like(x, math.sqrt(1 / (4 * math.pi))), k1 * y, k1 * z, k1 * x, k2 * x * y, k2 * y * z,
-                     math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1), k2 * x * z, k2 / 2 * (x * x - y * y)])
+    return np.stack(
+        [
+            np.full_like(x, math.sqrt(1 / (4 * math.pi))),
+            k1 * y,
+            k1 * z,
+            k1 * x,
+            k2 * x * y,
+            k2 * y * z,
+            math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1),
+            k2 * x * z,
+            k2 / 2 * (x * x - y * y),
+        ]
+    )
 
 
 @pytest.mark.parametrize("source", [(1, 1), (2, 4), (17, 34), (64, 128)], ids=str)
@@ -273,8 +315,7 @@ def test_harmonics_of_a_harmonic(device: Device, source: tuple[int, ...], which:
 @pytest.mark.few(2)
 @pytest.mark.parametrize("alpha", [0.04, 0.2, 1.0])
 @pytest.mark.parametrize("lanes", [1, 4, 16])
-def test_every_width_gives_the_same(device: Device, monkeypatch: pytest.MonkeyPatch, lanes: int,
-                                    alpha: float) -> None:
+def test_every_width_gives_the_same(device: Device, monkeypatch: pytest.MonkeyPatch, lanes: int, alpha: float) -> None:
     texels = noise(16, 32)
     n = plan.grid_size(alpha, 1e-2)
     usual = convolved(device, texels, ggx(device, alpha), n)

@@ -1,5 +1,6 @@
 """What engines show of a chain, and levels fitted to it: against closed forms, other forms of the same reads, and
 environments that no fit has seen."""
+
 from __future__ import annotations
 
 import json
@@ -65,8 +66,9 @@ def test_lod_and_roughness_are_inverse(levels):
         assert lod_of_roughness(r, levels) == pytest.approx(k, abs=1e-12)
         assert roughness_of_lod(k, levels) == r
     recipe = chain(levels=levels)
-    assert (hats(np.array([roughness_of_level(k, levels) for k in range(levels)]), recipe) ==
-            pytest.approx(np.eye(levels), abs=1e-12))
+    assert hats(np.array([roughness_of_level(k, levels) for k in range(levels)]), recipe) == pytest.approx(
+        np.eye(levels), abs=1e-12
+    )
     assert hats(scored(), recipe).sum(1) == pytest.approx(np.ones(len(scored())), abs=1e-12)
 
 
@@ -175,7 +177,7 @@ def test_references_are_the_exact_lobe_at_any_roughness(device: Device):
     for k, x in enumerate(r):
         lobe = ndf_lobe(device, recipe.ndf, x, recipe.parameters(x))
         want = convolver.exact([(lobe, reader.d)], 32 if x < 0.1 else 8)[0] / convolver.scale
-        got = reader.at_directions.at(r[k:k + 1])[0]
+        got = reader.at_directions.at(r[k : k + 1])[0]
         # TOLERANCE of the sharpest, coarser texels and interpolation of the others; a read errs by .1 to 1.
         assert np.sqrt(((got / want - 1) ** 2).mean()) <= (2e-2 if x < 0.1 else 6e-3), x
 
@@ -187,7 +189,7 @@ def test_roughness_zero_is_the_texel(device: Device, rotation):
     for source in (pixels, np.random.default_rng(4).random((6, 8, 8, 3), np.float32)):
         env = environment(source, rotate=rotation)
         index = np.arange(0, source.size // 3, 7)
-        centres = (latlong_centres(16, 32, index) if source.ndim == 3 else cube_centres(8, index))
+        centres = latlong_centres(16, 32, index) if source.ndim == 3 else cube_centres(8, index)
         turn = math.radians(rotation)  # about +Y, +X towards +Z
         c, s = math.cos(turn), math.sin(turn)
         world = np.stack([c * centres[0] - s * centres[2], centres[1], s * centres[0] + c * centres[2]])
@@ -368,15 +370,18 @@ def test_levels_and_sizes():
     assert chain(levels=7, min_size=16).canonical() != chain(levels=7).canonical()
 
 
-@pytest.mark.parametrize(("options", "told"), [
-    ({"levels": 10}, r"levels 10 is outside \[1, 9\]: from 256² each level halves"),
-    ({"levels": 0}, r"levels 0 is not a whole number in \[1, 32\]"),
-    ({"levels": 33, "min_size": 1}, r"levels 33 is not a whole number in \[1, 32\]"),
-    ({"levels": 2.5}, r"levels 2\.5 is not a whole number"),
-    ({"levels": 3, "min_size": 16}, r"levels 3 from 256² end at 64², not at min-size 16; .* at least 5 levels"),
-    ({"levels": 3, "min_size": 512}, "min-size 512 is larger than size 256"),
-    ({"fit": "raed"}, "unknown fit 'raed'; did you mean 'read'"),
-])
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"levels": 10}, r"levels 10 is outside \[1, 9\]: from 256² each level halves"),
+        ({"levels": 0}, r"levels 0 is not a whole number in \[1, 32\]"),
+        ({"levels": 33, "min_size": 1}, r"levels 33 is not a whole number in \[1, 32\]"),
+        ({"levels": 2.5}, r"levels 2\.5 is not a whole number"),
+        ({"levels": 3, "min_size": 16}, r"levels 3 from 256² end at 64², not at min-size 16; .* at least 5 levels"),
+        ({"levels": 3, "min_size": 512}, "min-size 512 is larger than size 256"),
+        ({"fit": "raed"}, "unknown fit 'raed'; did you mean 'read'"),
+    ],
+)
 def test_levels_and_fits_that_cannot_be_had(options, told):
     with pytest.raises(UsageError, match=told):
         chain(**options)
@@ -407,7 +412,13 @@ def test_a_plan_says_what_engines_would_show(capsys, tmp_path, image):
     assert code == 0
     found = [row for row in rows if row["event"] == "as_read"]
     assert [(row["levels"], row["fit"]) for row in found] == [
-        (3, None), (3, "read"), (5, None), (5, "read"), (6, None), (6, "read")]
+        (3, None),
+        (3, "read"),
+        (5, None),
+        (5, "read"),
+        (6, None),
+        (6, "read"),
+    ]
     assert [row["sizes"] for row in found[::2]] == [[32, 16, 8], [32, 16, 8, 8, 8], [32, 16, 8, 8, 8, 8]]
     for row in found[:2]:
         assert row["format"] == "float32" and set(row["parts"]) == {"between", "texels", "format", "all"}
@@ -448,11 +459,14 @@ def test_a_bake_that_is_not_asked_does_not_measure(capsys, tmp_path, image):
     assert "as_read" not in json.loads((tmp_path / "out" / "room.json").read_text())
 
 
-@pytest.mark.parametrize(("options", "told"), [
-    (("--levels", "12"), "levels 12 is outside [1, 9]"),
-    (("--levels", "3", "--min-size", "16"), "not at min-size 16"),
-    (("--fit", "write"), "unknown fit 'write'"),
-])
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        (("--levels", "12"), "levels 12 is outside [1, 9]"),
+        (("--levels", "3", "--min-size", "16"), "not at min-size 16"),
+        (("--fit", "write"), "unknown fit 'write'"),
+    ],
+)
 def test_what_the_command_refuses(capsys, tmp_path, image, options, told):
     code, _, text = shell(capsys, "bake", image, "-o", tmp_path / "out", *options)
     assert code == 1 and told in text

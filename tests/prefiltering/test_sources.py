@@ -1,5 +1,6 @@
 """What stands for an environment's texels: point masses, anterpolated grids, bright texels apart; against moments of
 the texels in closed form and by Gauss quadrature."""
+
 from __future__ import annotations
 
 import itertools
@@ -63,8 +64,9 @@ MASS = 1e-6
 
 @pytest.mark.parametrize("cuts", [1, 2])
 @pytest.mark.parametrize("at", [(8, 20), (5, 0), (5, 47), (0, 20), (0, 1), (1, 46), (23, 7), (22, 30)], ids=str)
-def test_masses_of_a_latlong_integrate_polynomials(device: Device, nothing_bright: None, at: tuple[int, int],
-                                                   cuts: int) -> None:
+def test_masses_of_a_latlong_integrate_polynomials(
+    device: Device, nothing_bright: None, at: tuple[int, int], cuts: int
+) -> None:
     """∫ sin θ f dθ dφ over 3 × 3 texels of noise by their masses: exact for sin θ f a polynomial of degree 5 in θ and
     in φ around them, beyond the poles (where sin θ is negative on the meridian that goes on) and the seam too."""
     texels = patch((24, 48), at)
@@ -89,16 +91,18 @@ def test_masses_of_a_latlong_integrate_polynomials(device: Device, nothing_brigh
                     y, sign = around(j + columns // 2), -1.0
                 got += sign * mass[i, j] * float(x) ** a * float(y) ** b
                 scale += np.abs(mass[i, j]) * abs(float(x)) ** a * abs(float(y)) ** b
-            want = sum(parts[i, j] * over(i - row, a) * over(around(j), b)
-                       for i, j in np.argwhere(parts.any(-1)).tolist())
+            want = sum(
+                parts[i, j] * over(i - row, a) * over(around(j), b) for i, j in np.argwhere(parts.any(-1)).tolist()
+            )
             want = want * math.pi / rows * 2 * math.pi / columns
             assert (np.abs(got - want) <= MASS * np.maximum(scale, np.abs(want))).all(), (at, a, b, got, want)
 
 
 @pytest.mark.parametrize("cuts", [1, 2])
 @pytest.mark.parametrize("at", [(8, 9), (0, 9), (9, 0), (0, 0), (19, 19), (1, 18), (2, 2), (17, 10)], ids=str)
-def test_masses_of_a_cube_integrate_polynomials(device: Device, nothing_bright: None, at: tuple[int, int],
-                                                cuts: int) -> None:
+def test_masses_of_a_cube_integrate_polynomials(
+    device: Device, nothing_bright: None, at: tuple[int, int], cuts: int
+) -> None:
     """∫ f (1 + s² + t²)^-3/2 ds dt on one face, exact for the integrand a polynomial in s and in t: of degree 5 inside;
     of 4 by the face's edges, where quartics lean to one side."""
     texels = patch((6, 20, 20), (3, *at))
@@ -117,8 +121,13 @@ def test_masses_of_a_cube_integrate_polynomials(device: Device, nothing_bright: 
         for b in range(degree + 1):
             got = np.einsum("ijc,i,j->c", mass, i**a, j**b)
             scale = np.einsum("ijc,i,j->c", np.abs(mass), np.abs(i) ** a, np.abs(j) ** b)
-            want = sum(parts[k, m] * over(k - at[0] * cuts, a) * over(m - at[1] * cuts, b)
-                       for k, m in np.argwhere(parts.any(-1)).tolist()) * (2 / n) ** 2
+            want = (
+                sum(
+                    parts[k, m] * over(k - at[0] * cuts, a) * over(m - at[1] * cuts, b)
+                    for k, m in np.argwhere(parts.any(-1)).tolist()
+                )
+                * (2 / n) ** 2
+            )
             assert (np.abs(got - want) <= MASS * np.maximum(scale, np.abs(want))).all(), (at, a, b, got, want)
 
 
@@ -253,8 +262,13 @@ def test_the_excess_of_a_sun_as_nodes(device: Device) -> None:
     theta = (7 + x) * math.pi / 24
     phi = (13 + x) * 2 * math.pi / 48 - math.pi + math.radians(20)
     omega = np.outer(w * np.sin(theta) * math.pi / 24, w * 2 * math.pi / 48)
-    d = np.stack([np.outer(np.sin(theta), np.cos(phi)), np.outer(np.cos(theta), np.ones(12)),
-                  np.outer(np.sin(theta), np.sin(phi))])
+    d = np.stack(
+        [
+            np.outer(np.sin(theta), np.cos(phi)),
+            np.outer(np.cos(theta), np.ones(12)),
+            np.outer(np.sin(theta), np.sin(phi)),
+        ]
+    )
     excess = t._excess[t._index.tolist().index(7 * 48 + 13)]
     assert listed[:, 4:7].sum(0) == pytest.approx(excess * omega.sum(), rel=2e-6)
     got = listed[:, :3].T @ listed[:, 4]

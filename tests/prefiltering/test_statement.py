@@ -1,5 +1,6 @@
 """What a level states about its error against the errors of all its texels, by float64 integrals in another form
 than the kernels': θ by Gauss, φ by Gauss on the pieces between the lobe's kinks."""
+
 from __future__ import annotations
 
 import functools
@@ -110,8 +111,11 @@ def synthetic(kind: str, seed: int) -> np.ndarray:
     v, u = np.meshgrid((np.arange(ROWS) + 0.5) / ROWS, (np.arange(COLUMNS) + 0.5) / COLUMNS, indexing="ij")
     if kind == "gradient":
         tilt = rng.random(3) * 2 * math.pi
-        pixels = 1.1 + np.cos(math.pi * v)[..., None] * 0.5 + 0.5 * np.sin(math.pi * v)[..., None] * np.cos(
-            2 * math.pi * u[..., None] + tilt)
+        pixels = (
+            1.1
+            + np.cos(math.pi * v)[..., None] * 0.5
+            + 0.5 * np.sin(math.pi * v)[..., None] * np.cos(2 * math.pi * u[..., None] + tilt)
+        )
     elif kind == "noise":
         pixels = noise
     elif kind == "sparkle":
@@ -125,7 +129,7 @@ def synthetic(kind: str, seed: int) -> np.ndarray:
         pixels = 0.01 + 0.05 * noise
         for _ in range(4):
             i, j = rng.integers(0, ROWS - 4), rng.integers(0, COLUMNS - 6)
-            pixels[i:i + 4, j:j + 6] = 20 * (1 + rng.random(3))
+            pixels[i : i + 4, j : j + 6] = 20 * (1 + rng.random(3))
     else:  # suns over noise, 1e5 × the mean of the rest
         pixels = 0.5 + noise
         for name in kind.split(" and "):
@@ -133,8 +137,19 @@ def synthetic(kind: str, seed: int) -> np.ndarray:
     return pixels.astype(np.float32)
 
 
-KINDS = ("gradient", "noise", "sparkle", "checker", "dark and bright", "panels", "edge", "corner", "pole", "face",
-         "edge and pole")
+KINDS = (
+    "gradient",
+    "noise",
+    "sparkle",
+    "checker",
+    "dark and bright",
+    "panels",
+    "edge",
+    "corner",
+    "pole",
+    "face",
+    "edge and pole",
+)
 CHAINS = ((32, 8), (32, 16), (32, 4))  # of levels of 16² and 8² at r = .18, .29, .42 and 1
 SEEDS = range(3)
 
@@ -163,9 +178,18 @@ def cases(kind: str) -> list[dict]:
                     continue
                 reference = (matrix(s, r * r, tuple(SUNS.values())) @ flat).reshape(values.shape)
                 covered, p99, worst, rmse = judge(chain, r, k, reference)
-                found.append({"case": f"{kind} {seed}, {s}² at r = {r:.3f}", "covered": covered, "true_p99": p99,
-                              "true_worst": worst, "true_rmse": rmse, "error": float(chain.error[k]),
-                              "worst": float(chain.worst[k]), "rmse": float(chain.rmse[k])})
+                found.append(
+                    {
+                        "case": f"{kind} {seed}, {s}² at r = {r:.3f}",
+                        "covered": covered,
+                        "true_p99": p99,
+                        "true_worst": worst,
+                        "true_rmse": rmse,
+                        "error": float(chain.error[k]),
+                        "worst": float(chain.worst[k]),
+                        "rmse": float(chain.rmse[k]),
+                    }
+                )
     return found
 
 
@@ -212,14 +236,16 @@ def test_the_stated_error_covers_99_of_100_texels_at_95_percent():
 @pytest.mark.parametrize("shape", [(1, 1, 3), (2, 4, 3), (4, 8, 3), (24, 48, 3), (6, 2, 2, 3), (6, 8, 8, 3)], ids=str)
 def test_harmonics_state_their_error(shape):
     x, y, z = (d := texel_nodes(np.zeros(shape), 0.0, 12))[0].T
-    basis = np.stack([
-        0.5 * math.sqrt(1 / math.pi) * np.ones_like(x),
-        *(math.sqrt(3 / (4 * math.pi)) * c for c in (y, z, x)),
-        *(math.sqrt(15 / (4 * math.pi)) * c for c in (x * y, y * z)),
-        math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1),
-        math.sqrt(15 / (4 * math.pi)) * x * z,
-        math.sqrt(15 / (16 * math.pi)) * (x * x - y * y),
-    ])
+    basis = np.stack(
+        [
+            0.5 * math.sqrt(1 / math.pi) * np.ones_like(x),
+            *(math.sqrt(3 / (4 * math.pi)) * c for c in (y, z, x)),
+            *(math.sqrt(15 / (4 * math.pi)) * c for c in (x * y, y * z)),
+            math.sqrt(5 / (16 * math.pi)) * (3 * z * z - 1),
+            math.sqrt(15 / (4 * math.pi)) * x * z,
+            math.sqrt(15 / (16 * math.pi)) * (x * x - y * y),
+        ]
+    )
     for seed, power in ((0, 1), (1, 20)):
         pixels = (np.random.default_rng(seed).random(shape) ** power).astype(np.float32)
         want = (basis * d[1]) @ pixels.reshape(-1, 3)[d[2]].astype(np.float64)

@@ -1,5 +1,6 @@
 """The sums by the symmetries of the cube against a double loop in float64 numpy over all pairs, with the NDF's own
 reference."""
+
 from __future__ import annotations
 
 import math
@@ -30,7 +31,9 @@ def whole(n: int) -> list[Part]:
 
 
 PARTS = {
-    "one of 24": whole(24), "one of 32": whole(32), "one of 64": whole(64),
+    "one of 24": whole(24),
+    "one of 32": whole(32),
+    "one of 64": whole(64),
     "two": [Part(64, None, MIDDLE), Part(32, MIDDLE, None)],
     "three": [Part(96, None, NEAR), Part(64, NEAR, MIDDLE), Part(32, MIDDLE, None)],
 }
@@ -76,8 +79,9 @@ def step(q: np.ndarray, window: Window) -> np.ndarray:
     return 140 * (t**4 / 4 - 3 * t**5 / 5 + 3 * t**6 / 6 - t**7 / 7)
 
 
-def truth(lobe: Lobe, parts: list[Part], grids: dict[int, np.ndarray], directions: np.ndarray,
-          bright: np.ndarray | None) -> np.ndarray:
+def truth(
+    lobe: Lobe, parts: list[Part], grids: dict[int, np.ndarray], directions: np.ndarray, bright: np.ndarray | None
+) -> np.ndarray:
     """(m, 3): what `unfold` writes at directions (3, m)."""
     sums, weight = np.zeros((directions.shape[1], 3)), np.zeros(directions.shape[1])
 
@@ -101,13 +105,22 @@ def truth(lobe: Lobe, parts: list[Part], grids: dict[int, np.ndarray], direction
 def bright_list(count: int) -> np.ndarray:
     rng = np.random.default_rng(count)
     d = rng.normal(size=(count, 3))
-    return np.concatenate([d / np.linalg.norm(d, axis=1)[:, None], np.zeros((count, 1)), rng.random((count, 3)),
-                           np.zeros((count, 1))], 1)
+    return np.concatenate(
+        [d / np.linalg.norm(d, axis=1)[:, None], np.zeros((count, 1)), rng.random((count, 3)), np.zeros((count, 1))], 1
+    )
 
 
-def symmetric(o: Octahedral, shape: Shape, lobe: Lobe, parts: list[Part], grids: dict[int, np.ndarray],
-              bright: np.ndarray | None = None, splits: int = 2, error: float = 1e-7,
-              most: int = 1 << 14) -> np.ndarray:
+def symmetric(
+    o: Octahedral,
+    shape: Shape,
+    lobe: Lobe,
+    parts: list[Part],
+    grids: dict[int, np.ndarray],
+    bright: np.ndarray | None = None,
+    splits: int = 2,
+    error: float = 1e-7,
+    most: int = 1 << 14,
+) -> np.ndarray:
     """(dims, 3) float32 from the device; NaN where no texel was written."""
     level = o.device.array(np.full((*shape.dims, 3), np.nan, np.float32), writable=True)
     buffers = {n: o.device.array(values.astype(o.kind)) for n, values in grids.items()}
@@ -131,19 +144,26 @@ def looked_at(shape: Shape, count: int = 150) -> np.ndarray:
     if shape.count <= count:
         return np.arange(shape.count)
     index = np.arange(shape.count).reshape(shape.dims)
-    special = index[0] if shape.latlong else np.concatenate([
-        np.diagonal(index[4]), np.diagonal(index[1, ::-1]), index[2, shape.size // 2], index[5, 0]])
+    special = (
+        index[0]
+        if shape.latlong
+        else np.concatenate(
+            [np.diagonal(index[4]), np.diagonal(index[1, ::-1]), index[2, shape.size // 2], index[5, 0]]
+        )
+    )
     return np.unique(np.concatenate([special, np.random.default_rng(1).choice(shape.count, count, replace=False)]))
 
 
-def assert_level(level: np.ndarray, shape: Shape, want: np.ndarray, index: np.ndarray, tolerance: float,
-                 context: object) -> None:
+def assert_level(
+    level: np.ndarray, shape: Shape, want: np.ndarray, index: np.ndarray, tolerance: float, context: object
+) -> None:
     assert np.isfinite(level).all(), f"{context}: {(~np.isfinite(level)).any(-1).sum()} texels were not written"
     got = level.reshape(-1, 3)[index]
     error = np.abs(got - want) / want
     k = np.unravel_index(error.argmax(), error.shape)
-    assert error.max() <= tolerance, (f"{context}: texel {index[k[0]]}, got {got[k]}, wanted {want[k]}, "
-                                      f"error {error.max():.2e} > {tolerance:.1e}")
+    assert error.max() <= tolerance, (
+        f"{context}: texel {index[k[0]]}, got {got[k]}, wanted {want[k]}, error {error.max():.2e} > {tolerance:.1e}"
+    )
 
 
 # Of float32: directions are rounded by 6e-8, which turns q by 6e-8/√q of itself and K ~ q^-2 by twice that; α = .04
@@ -248,8 +268,9 @@ def test_pieces_of_images_change_nothing(device: Device, monkeypatch: pytest.Mon
     assert np.abs(got / want - 1).max() <= 3e-6  # the same terms, their sums cut elsewhere
 
 
-@pytest.mark.parametrize("shape", [*(Shape(False, n) for n in (1, 16, 33, 64)), Shape(True, 2), Shape(True, 34)],
-                         ids=str)
+@pytest.mark.parametrize(
+    "shape", [*(Shape(False, n) for n in (1, 16, 33, 64)), Shape(True, 2), Shape(True, 34)], ids=str
+)
 def test_the_same_bits_each_time(device: Device, shape: Shape) -> None:
     """Texels on planes of symmetry have several images of themselves, of which one alone may be written."""
     o, lobe = Octahedral(device, 32), ggx(device, 0.3)
@@ -270,7 +291,7 @@ def test_the_same_bits_each_time(device: Device, shape: Shape) -> None:
 
 def images(shape: Shape, found: Orbits) -> np.ndarray:
     """(images · count, 3) directions of all that the orbits stand for."""
-    d = found.direction[:, :found.count].T
+    d = found.direction[:, : found.count].T
     mirrored = [d * np.array([1 - 2 * (s & 1), 1 - (s & 2), 1 - (s & 4) // 2]) for s in range(8)]
     orders = [(0, 1, 2), (2, 1, 0)] + ([] if shape.latlong else [(1, 2, 0), (2, 0, 1), (0, 2, 1), (1, 0, 2)])
     return np.concatenate([m[:, order] for m in mirrored for order in orders])

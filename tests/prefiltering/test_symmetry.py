@@ -1,5 +1,6 @@
 """Baking commutes with whatever maps the cube onto itself: the 24 rotations and their mirror images; and with turns
 and mirrors of a lat-long."""
+
 from __future__ import annotations
 
 import functools
@@ -25,8 +26,12 @@ def cube_directions(n):
     middle = 2 * np.arange(n) + 1 - n
     t, s = np.meshgrid(middle, middle, indexing="ij")
     one = np.full_like(s, n)
-    return np.array([np.stack(f, -1) for f in
-                     [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]])
+    return np.array(
+        [
+            np.stack(f, -1)
+            for f in [(one, -t, -s), (-one, -t, s), (s, one, t), (s, -one, -t), (s, -t, one), (-s, -t, -one)]
+        ]
+    )
 
 
 def signed_permutations():
@@ -117,14 +122,18 @@ def panorama():
 QUARTER = np.array([[0, 0, -1], [0, 1, 0], [1, 0, 0]])  # azimuth atan2(z, x) grows by 90°: a shift right by w/4
 
 
-@pytest.mark.parametrize("change, matrix", [
-    (lambda p: np.roll(p, 16, 1), QUARTER),
-    (lambda p: np.roll(p, 32, 1), QUARTER @ QUARTER),
-    (lambda p: np.roll(p, -16, 1), QUARTER.T),
-    (lambda p: p[:, ::-1], np.diag([1, 1, -1])),  # u -> 1 - u: z changes sign
-    (lambda p: p[::-1], np.diag([1, -1, 1])),
-    (lambda p: p[::-1, ::-1], np.diag([1, -1, -1])),
-], ids=["quarter", "half", "back", "mirrored", "upside down", "turned over"])
+@pytest.mark.parametrize(
+    "change, matrix",
+    [
+        (lambda p: np.roll(p, 16, 1), QUARTER),
+        (lambda p: np.roll(p, 32, 1), QUARTER @ QUARTER),
+        (lambda p: np.roll(p, -16, 1), QUARTER.T),
+        (lambda p: p[:, ::-1], np.diag([1, 1, -1])),  # u -> 1 - u: z changes sign
+        (lambda p: p[::-1], np.diag([1, -1, 1])),
+        (lambda p: p[::-1, ::-1], np.diag([1, -1, -1])),
+    ],
+    ids=["quarter", "half", "back", "mirrored", "upside down", "turned over"],
+)
 def test_a_latlong_that_is_shifted_or_mirrored(change, matrix):
     want = prefilter(panorama(), **SIZES).values
     got = prefilter(np.ascontiguousarray(change(panorama())), **SIZES).values

@@ -1,5 +1,6 @@
 """Spheres of a scene's materials: each is the sphere that the grid has of the same numbers, in the order of the file,
 and what it leaves out of its material is said."""
+
 from __future__ import annotations
 
 import json
@@ -36,8 +37,11 @@ def baked(tmp_path_factory) -> Path:
 
 def plain(r: float, m: float, color=GOLD, **extensions) -> dict:
     made = {"pbrMetallicRoughness": {"baseColorFactor": [*color, 1], "metallicFactor": m, "roughnessFactor": r}}
-    return {**made, "extensions": {f"KHR_materials_{name}": value for name, value in extensions.items()}} \
-        if extensions else made
+    return (
+        {**made, "extensions": {f"KHR_materials_{name}": value for name, value in extensions.items()}}
+        if extensions
+        else made
+    )
 
 
 def scene(path: Path, materials: list[dict], images=()) -> Path:
@@ -65,10 +69,25 @@ def test_a_sphere_is_that_of_the_grid(baked, tmp_path, engine):
     turned = read_stored(tmp_path / "b.exr")
     for got, grid in zip(np.split(turned, 3, 2), np.split(want, 3, 2), strict=True):
         assert np.array_equal(cells(got, 3)[::-1], cells(grid, 3))
-    shading.render(baked / "noise.json", tmp_path / "grid.png", for_=engine, size=SIZE, columns=3, rows=2,
-                     base_color=GOLD, background="plain")
-    shading.render(baked / "noise.json", tmp_path / "a.png", for_=engine, size=SIZE, columns=3,
-                     scene=tmp_path / "a.gltf", background="plain")
+    shading.render(
+        baked / "noise.json",
+        tmp_path / "grid.png",
+        for_=engine,
+        size=SIZE,
+        columns=3,
+        rows=2,
+        base_color=GOLD,
+        background="plain",
+    )
+    shading.render(
+        baked / "noise.json",
+        tmp_path / "a.png",
+        for_=engine,
+        size=SIZE,
+        columns=3,
+        scene=tmp_path / "a.gltf",
+        background="plain",
+    )
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "grid.png").read_bytes()
 
 
@@ -77,10 +96,19 @@ def test_an_index_is_seen_in_the_picture_and_in_truth(baked, tmp_path, engine):
     """An insulator whose F0 is 1 in one channel is there what a metal of base colour 1 is: nothing is diffuse. Its F0
     of 0 is in another what is left of it, [Schlick1994]'s F90, and .25 of n = 3 lies between as F is linear in F0."""
     tint = {"ior": {"ior": 0}, "specular": {"specularColorFactor": [1, 0, 0.25]}}
-    path = scene(tmp_path / "s.gltf", [plain(0.5, 0, (0, 0, 0), **tint), plain(0.5, 1, (1, 0, 0.25)),
-                                       plain(0.5, 0, (0, 0, 0), ior={"ior": 3})])
-    made = beside.render(baked / "noise.json", tmp_path / "s.exr", for_=engine, truth=baked / "noise.exr", size=SIZE,
-                         scene=path, background="plain")
+    path = scene(
+        tmp_path / "s.gltf",
+        [plain(0.5, 0, (0, 0, 0), **tint), plain(0.5, 1, (1, 0, 0.25)), plain(0.5, 0, (0, 0, 0), ior={"ior": 3})],
+    )
+    made = beside.render(
+        baked / "noise.json",
+        tmp_path / "s.exr",
+        for_=engine,
+        truth=baked / "noise.exr",
+        size=SIZE,
+        scene=path,
+        background="plain",
+    )
     assert [one["f0"] for one in made.materials] == [(1, 0, 0.25), (0.04,) * 3, (0.25,) * 3]
     for layer in np.split(read_stored(tmp_path / "s.exr"), 3, 2)[1:]:
         insulator, metal, third = cells(layer, 3)
@@ -94,8 +122,14 @@ def test_a_texture_counts_with_its_mean(tmp_path):
     """Half of the texels at G = 0, half at 255, of a factor .8: r = .4; base colours are averaged in linear light."""
     image = np.zeros((8, 8, 3), np.uint8)
     image[:4] = 255
-    textured = {"pbrMetallicRoughness": {"roughnessFactor": 0.8, "metallicFactor": 0.5,
-                                         "metallicRoughnessTexture": {"index": 0}, "baseColorTexture": {"index": 0}}}
+    textured = {
+        "pbrMetallicRoughness": {
+            "roughnessFactor": 0.8,
+            "metallicFactor": 0.5,
+            "metallicRoughnessTexture": {"index": 0},
+            "baseColorTexture": {"index": 0},
+        }
+    }
     path = scene(tmp_path / "s.gltf", [textured, plain(0.3, 1)], [image])
     found = material_spheres.of_scene(material_spheres.read_scene(path))
     one, other = found.spheres
@@ -107,17 +141,24 @@ def test_a_texture_counts_with_its_mean(tmp_path):
 
 def test_what_is_left_out_is_said(tmp_path):
     """Each kind once, with the materials that have it; what is plain is in none."""
-    kinds = {"clearcoat": ({"clearcoatFactor": 1}, "clear coat"), "sheen": ({"sheenColorFactor": [1, 0, 0]}, "sheen"),
-             "transmission": ({"transmissionFactor": 0.5}, "transmission"),
-             "anisotropy": ({"anisotropyStrength": 0.5}, "anisotropy"),
-             "iridescence": ({"iridescenceFactor": 1}, "iridescence"),
-             "diffuse_transmission": ({"diffuseTransmissionFactor": 1}, "diffuse transmission"),
-             "specular": ({"specularFactor": 0.5}, "a specular factor below 1")}
+    kinds = {
+        "clearcoat": ({"clearcoatFactor": 1}, "clear coat"),
+        "sheen": ({"sheenColorFactor": [1, 0, 0]}, "sheen"),
+        "transmission": ({"transmissionFactor": 0.5}, "transmission"),
+        "anisotropy": ({"anisotropyStrength": 0.5}, "anisotropy"),
+        "iridescence": ({"iridescenceFactor": 1}, "iridescence"),
+        "diffuse_transmission": ({"diffuseTransmissionFactor": 1}, "diffuse transmission"),
+        "specular": ({"specularFactor": 0.5}, "a specular factor below 1"),
+    }
     materials = [plain(0.5, 0, **{name: value}) for name, (value, _) in kinds.items()]
-    materials += [plain(0.5, 0), plain(0.5, 0, clearcoat={"clearcoatFactor": 0}), plain(0.5, 0, unlit={}),
-                  {**plain(0.5, 0), "emissiveFactor": [1, 1, 1]},
-                  plain(0.5, 0, transmission={"transmissionFactor": 1}, volume={"thicknessFactor": 1}),
-                  plain(0.5, 0, fur={})]
+    materials += [
+        plain(0.5, 0),
+        plain(0.5, 0, clearcoat={"clearcoatFactor": 0}),
+        plain(0.5, 0, unlit={}),
+        {**plain(0.5, 0), "emissiveFactor": [1, 1, 1]},
+        plain(0.5, 0, transmission={"transmissionFactor": 1}, volume={"thicknessFactor": 1}),
+        plain(0.5, 0, fur={}),
+    ]
     found = material_spheres.of_scene(material_spheres.read_scene(scene(tmp_path / "s.gltf", materials)))
     said = {}
     for notice in found.notices:
@@ -125,9 +166,13 @@ def test_what_is_left_out_is_said(tmp_path):
         assert what not in said
         said[what.partition(" is left out")[0]] = who
     want = {what: f"m{k}" for k, (_, what) in enumerate(kinds.values())}
-    want |= {"transmission": "m2, m11", "volume": "m11", "light of its own": "m10",
-             "unlit, no sphere is drawn of it": "m9",
-             "KHR_materials_fur is not read, what it falls back to is drawn": "m12"}
+    want |= {
+        "transmission": "m2, m11",
+        "volume": "m11",
+        "light of its own": "m10",
+        "unlit, no sphere is drawn of it": "m9",
+        "KHR_materials_fur is not read, what it falls back to is drawn": "m12",
+    }
     assert said == want
     assert [one.name for one in found.spheres] == [f"m{k}" for k in range(13) if k != 9]
     assert found.spheres[6].insulator == pytest.approx((0.02,) * 3)
@@ -151,19 +196,36 @@ def test_the_command_names_each_with_its_place(baked, tmp_path):
     """Also what is nearly a mirror, and names that no font of the picture has, or that TeX would read."""
     pytest.importorskip("matplotlib")
     names = ["金 $x_1^", "rubber", "glass"]
-    made = [{"name": name, **one} for name, one in zip(names, (plain(0.004, 1), plain(0.8, 0), plain(0.1, 0)),
-                                                       strict=True)]
+    made = [
+        {"name": name, **one} for name, one in zip(names, (plain(0.004, 1), plain(0.8, 0), plain(0.1, 0)), strict=True)
+    ]
     path = as_glb(tmp_path / "s.glb", document(made))
-    asked = ["render", str(baked / "noise.json"), "--for", "filament", "--size", "16", "--columns", "2", "--scene",
-             str(path)]
+    asked = [
+        "render",
+        str(baked / "noise.json"),
+        "--for",
+        "filament",
+        "--size",
+        "16",
+        "--columns",
+        "2",
+        "--scene",
+        str(path),
+    ]
     done = CliRunner().invoke(cli, [*asked, "-o", str(tmp_path / "a.png"), "--json"], catch_exceptions=False)
     row = json.loads(done.stdout)
     assert (row["width"], row["height"], row["roughness"], row["metalness"]) == (32, 32, [], [])
     assert [(one["name"], one["row"], one["column"]) for one in row["materials"]] == [
-        (names[0], 1, 1), (names[1], 1, 2), (names[2], 2, 1)]
+        (names[0], 1, 1),
+        (names[1], 1, 2),
+        (names[2], 2, 1),
+    ]
     for suffix in ("png", "exr"):
-        done = CliRunner().invoke(cli, [*asked, "-o", str(tmp_path / f"b.{suffix}"), "--truth",
-                                        str(baked / "noise.exr")], catch_exceptions=False)
+        done = CliRunner().invoke(
+            cli,
+            [*asked, "-o", str(tmp_path / f"b.{suffix}"), "--truth", str(baked / "noise.exr")],
+            catch_exceptions=False,
+        )
         assert done.exit_code == 0, done.output
         lines = done.stdout.splitlines()[2:5]
         for line, name, place in zip(lines, names, (["1", "1"], ["1", "2"], ["2", "1"]), strict=True):
@@ -182,23 +244,27 @@ def lights_of(baked: Path):
     return engine, shading.read_lights(engine, folder, stem)
 
 
-@pytest.mark.parametrize(("options", "error", "said"), [
-    ({"rows": 2}, UsageError, "rows are of the grid"),
-    ({"base_color": (1, 1, 1)}, UsageError, "base color is of the grid"),
-    ({"columns": 65}, UsageError, r"columns 65 is outside \[1, 64\]"),
-    ({"metal": "schlick:gold"}, UsageError, "metal is of the grid"),
-    ({"dielectric": "schlick:f0=.1"}, UsageError, "dielectric is of the grid"),
-    ({"scene": "unlit.gltf"}, InputError, "no materials that light falls on"),
-    ({"scene": "broken.glb"}, InputError, r"broken\.glb"),
-])
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"rows": 2}, UsageError, "rows are of the grid"),
+        ({"base_color": (1, 1, 1)}, UsageError, "base color is of the grid"),
+        ({"columns": 65}, UsageError, r"columns 65 is outside \[1, 64\]"),
+        ({"metal": "schlick:gold"}, UsageError, "metal is of the grid"),
+        ({"dielectric": "schlick:f0=.1"}, UsageError, "dielectric is of the grid"),
+        ({"scene": "unlit.gltf"}, InputError, "no materials that light falls on"),
+        ({"scene": "broken.glb"}, InputError, r"broken\.glb"),
+    ],
+)
 def test_what_cannot_be_drawn_is_said(baked, tmp_path, options, error, said):
     scene(tmp_path / "unlit.gltf", [plain(0.5, 0, unlit={})])
     (tmp_path / "broken.glb").write_bytes(b"glTF")
     path = tmp_path / options.pop("scene") if "scene" in options else scene(tmp_path / "s.gltf", [plain(0.5, 0)])
     with pytest.raises(error, match=said) as raised:
         if {"metal", "dielectric"} & set(options):
-            beside.render(baked / "noise.json", tmp_path / "x.exr", for_="three", truth=baked / "noise.exr", scene=path,
-                          **options)
+            beside.render(
+                baked / "noise.json", tmp_path / "x.exr", for_="three", truth=baked / "noise.exr", scene=path, **options
+            )
         else:
             shading.render(baked / "noise.json", tmp_path / "x.png", for_="three", scene=path, **options)
     assert "\n" not in str(raised.value) and not list(tmp_path.glob("x.*"))

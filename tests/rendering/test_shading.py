@@ -1,5 +1,6 @@
 """The renderer reads an engine's own files and shades as the engine does: closed forms for constant light, directions
 that say where they are, levels that say which they are."""
+
 from __future__ import annotations
 
 import json
@@ -34,13 +35,26 @@ from whitefurnace.sphere import octahedral_map as octamap
 from whitefurnace.sphere.grids import cube_centres
 
 OWN = Engine(
-    name="own", lod="max_lod * r", axes="+z -x +y", sh="radiance", dfg=Dfg(64, x="alpha", y="NoV", NoV="sqrt"),
-    file=(File("specular", "{stem}.dds", "rgba16f"), File("sh", "{stem}.json"), File("dfg", "{stem}_dfg.exr")))
+    name="own",
+    lod="max_lod * r",
+    axes="+z -x +y",
+    sh="radiance",
+    dfg=Dfg(64, x="alpha", y="NoV", NoV="sqrt"),
+    file=(File("specular", "{stem}.dds", "rgba16f"), File("sh", "{stem}.json"), File("dfg", "{stem}_dfg.exr")),
+)
 MAPS, ATLAS = (
-    Engine(name=name, lod="max_lod * r", dfg=Dfg(64),
-           file=(File("specular", f"{{stem}}{suffix}", layout="octahedral", border=border),
-                 File("irradiance", "{stem}_i.ktx2", "rgba16f"), File("dfg", "{stem}_dfg.ktx2", "rg16f")))
-    for name, suffix, border in (("maps", ".ktx2", 0), ("atlas", ".exr", 2)))
+    Engine(
+        name=name,
+        lod="max_lod * r",
+        dfg=Dfg(64),
+        file=(
+            File("specular", f"{{stem}}{suffix}", layout="octahedral", border=border),
+            File("irradiance", "{stem}_i.ktx2", "rgba16f"),
+            File("dfg", "{stem}_dfg.ktx2", "rg16f"),
+        ),
+    )
+    for name, suffix, border in (("maps", ".ktx2", 0), ("atlas", ".exr", 2))
+)
 ALL = [engine for engine in ENGINES.values() if engine.holding("specular") or engine.container != "files"]
 ALL += [OWN, MAPS, ATLAS]
 AXES = {name: preset.published.direction for name, preset in PRESETS.items() if preset.published} | {"own": (3, -1, 2)}
@@ -79,8 +93,14 @@ def written(engine: Engine, folder, light, diffuse, split=(1.0, 0.0)) -> None:
     pair = (B, A + B) if engine.dfg.form == "multiscatter" else (A, B)
     table = np.broadcast_to(np.array([*pair, 0.0], np.float32), (engine.dfg.size, engine.dfg.size, 3))
     if engine.container == "npz":
-        write_npz(folder / "x.npz", {**{f"specular_{k}": level for k, level in enumerate(levels)},
-                                     "irradiance": cube(32, diffuse), "dfg": table[..., :2]})
+        write_npz(
+            folder / "x.npz",
+            {
+                **{f"specular_{k}": level for k, level in enumerate(levels)},
+                "irradiance": cube(32, diffuse),
+                "dfg": table[..., :2],
+            },
+        )
     if engine.container == "exr":
         for k, level in enumerate(levels):
             write_exr(folder / f"x_specular_{k}.exr", level.reshape(-1, level.shape[2], 3))
@@ -103,12 +123,16 @@ def written(engine: Engine, folder, light, diffuse, split=(1.0, 0.0)) -> None:
         elif file.holds == "dfg":
             write_texture(path, encode(file.stored, [table[..., :2] if file.stored == "rg16f" else table]).texture)
         elif file.layout == "octahedral":
-            maps = [light(k, octamap.texel_directions(64 >> k)).reshape(64 >> k, 64 >> k, 3).astype(np.float32)
-                    for k in range(count)]
+            maps = [
+                light(k, octamap.texel_directions(64 >> k)).reshape(64 >> k, 64 >> k, 3).astype(np.float32)
+                for k in range(count)
+            ]
             if file.suffix == ".exr":
                 write_exr(path, octamap.to_atlas(maps, file.border)[0])
-                write_manifest(folder.parent / "x.json", {"whitefurnace": "0", "files": {
-                    f"{folder.name}/{path.name}": {"levels": [{}] * count}}})
+                write_manifest(
+                    folder.parent / "x.json",
+                    {"whitefurnace": "0", "files": {f"{folder.name}/{path.name}": {"levels": [{}] * count}}},
+                )
             else:
                 write_texture(path, encode(file.stored, maps).texture)
         elif file.holds in ("specular", "irradiance"):
@@ -202,11 +226,28 @@ def as_written(formula: str, c: float, m: float, r: float, NoV: float) -> tuple[
 
 @pytest.mark.parametrize("formula", shading.SHADINGS)
 def test_weights_are_those_of_the_engines_shader(formula):
-    got = np.array([[np.array(shading.SHADINGS[formula](
-        np.array([[Y - X]]), np.array([[X]]), np.array([[c]]), np.array([[m]]), np.array([[r]]), np.array([[0.4]]))
-    ).ravel() for c in (0.0, 0.3, 1.0)] for m in (0.0, 0.25, 1.0) for r in (0.2, 0.9)])
-    wanted = np.array([[as_written(formula, c, m, r, 0.4) for c in (0.0, 0.3, 1.0)] for m in (0.0, 0.25, 1.0)
-                       for r in (0.2, 0.9)])
+    got = np.array(
+        [
+            [
+                np.array(
+                    shading.SHADINGS[formula](
+                        np.array([[Y - X]]),
+                        np.array([[X]]),
+                        np.array([[c]]),
+                        np.array([[m]]),
+                        np.array([[r]]),
+                        np.array([[0.4]]),
+                    )
+                ).ravel()
+                for c in (0.0, 0.3, 1.0)
+            ]
+            for m in (0.0, 0.25, 1.0)
+            for r in (0.2, 0.9)
+        ]
+    )
+    wanted = np.array(
+        [[as_written(formula, c, m, r, 0.4) for c in (0.0, 0.3, 1.0)] for m in (0.0, 0.25, 1.0) for r in (0.2, 0.9)]
+    )
     np.testing.assert_allclose(got, wanted, atol=1e-10)
 
 
@@ -214,13 +255,23 @@ def test_every_shading_of_a_preset_is_there():
     assert {engine.shading for engine in ALL} == set(shading.SHADINGS)
 
 
-@pytest.mark.parametrize(("x", "y", "NoV"), [("NoV", "roughness", "centres"), ("roughness", "NoV", "centres"),
-                                             ("NoV", "alpha", "sqrt"), ("alpha", "NoV", "sqrt")])
+@pytest.mark.parametrize(
+    ("x", "y", "NoV"),
+    [
+        ("NoV", "roughness", "centres"),
+        ("roughness", "NoV", "centres"),
+        ("NoV", "alpha", "sqrt"),
+        ("alpha", "NoV", "sqrt"),
+    ],
+)
 def test_a_table_is_read_on_its_axes(x, y, NoV):
     """A table that holds its own axes, which a bilinear read gives back exactly between the first and last texel."""
     n = 16
-    values = {"roughness": (np.arange(n) + 0.5) / n, "alpha": (np.arange(n) + 0.5) / n,
-              "NoV": np.arange(n) / (n - 1) if NoV == "sqrt" else (np.arange(n) + 0.5) / n}
+    values = {
+        "roughness": (np.arange(n) + 0.5) / n,
+        "alpha": (np.arange(n) + 0.5) / n,
+        "NoV": np.arange(n) / (n - 1) if NoV == "sqrt" else (np.arange(n) + 0.5) / n,
+    }
     across, down = np.meshgrid(values[x], values[y])
     held = np.stack([across, down] if x == "NoV" else [down, across], -1)
     rng = np.random.default_rng(3)
@@ -294,9 +345,18 @@ def test_roughness_bends_blends_and_has_a_least():
 
 
 # lod at r = 0, 1/2 and 1 of those chains, by the published mappings.
-LODS = {"raw": (0, 0.75 * 2, 2), "exr": (0, 0.75 * 2, 2), "three": (0, 0.75 * 3, 3), "filament": (0, 0.75 * 4, 4),
-        "babylon": (0, 0.8 * math.log2(64 * 0.2505), 0.8 * math.log2(64 * 1.0005)), "bevy": (0, 1, 2),
-        "gltf": (0, 1, 2), "khronos": (0, 1, 2), "unity": (0, 4.05, 6), "unreal": (0, 2.8, 4)}
+LODS = {
+    "raw": (0, 0.75 * 2, 2),
+    "exr": (0, 0.75 * 2, 2),
+    "three": (0, 0.75 * 3, 3),
+    "filament": (0, 0.75 * 4, 4),
+    "babylon": (0, 0.8 * math.log2(64 * 0.2505), 0.8 * math.log2(64 * 1.0005)),
+    "bevy": (0, 1, 2),
+    "gltf": (0, 1, 2),
+    "khronos": (0, 1, 2),
+    "unity": (0, 4.05, 6),
+    "unreal": (0, 2.8, 4),
+}
 UNLISTED = {name: preset.published for name, preset in PRESETS.items() if name not in LODS}
 """Presets that come later: read at their own formulas, which tests/engines/test_presets.py holds against published
 numbers."""
@@ -337,8 +397,15 @@ def baked(tmp_path):
     (tmp_path / "godot").mkdir()
     (tmp_path / "godot" / "x.hdr").write_bytes(b"anything")
     files = {f"{path.parent.name}/{path.name}": {"sha256": digest_file(path)} for path in sorted(tmp_path.glob("*/*"))}
-    write_manifest(tmp_path / "x.json", {"whitefurnace": "0", "name": "x", "files": files, "recipe": {
-        "engines": {"filament": {"engine": engine.data()}}}})
+    write_manifest(
+        tmp_path / "x.json",
+        {
+            "whitefurnace": "0",
+            "name": "x",
+            "files": files,
+            "recipe": {"engines": {"filament": {"engine": engine.data()}}},
+        },
+    )
     return tmp_path / "x.json"
 
 
@@ -367,18 +434,21 @@ def test_the_background_is_what_a_camera_sees(tmp_path):
         assert picture[row, column] == pytest.approx(1 + d / 2, abs=0.02)  # BC6H
 
 
-@pytest.mark.parametrize(("options", "error", "said"), [
-    ({"for_": "three"}, UsageError, "was not baked for three; it has filament, godot"),
-    ({"for_": "filement"}, UsageError, "did you mean 'filament'"),
-    ({"for_": "godot"}, UnsupportedError, "there is no prefiltered chain"),
-    ({"for_": "filament,godot"}, UsageError, "a picture is of one"),
-    ({"size": 7}, UsageError, r"size 7 is outside \[8, 2048\]"),
-    ({"columns": 0}, UsageError, "columns 0 is outside"),
-    ({"size": 2048, "columns": 64, "rows": 64}, UsageError, "are more than"),
-    ({"exposure": math.nan}, UsageError, "exposure nan is outside"),
-    ({"base_color": (0.5, 2.0, 0.5)}, UsageError, "base color 0.5 2 0.5 is not"),
-    ({"background": "sky"}, UsageError, "neither environment nor plain"),
-])
+@pytest.mark.parametrize(
+    ("options", "error", "said"),
+    [
+        ({"for_": "three"}, UsageError, "was not baked for three; it has filament, godot"),
+        ({"for_": "filement"}, UsageError, "did you mean 'filament'"),
+        ({"for_": "godot"}, UnsupportedError, "there is no prefiltered chain"),
+        ({"for_": "filament,godot"}, UsageError, "a picture is of one"),
+        ({"size": 7}, UsageError, r"size 7 is outside \[8, 2048\]"),
+        ({"columns": 0}, UsageError, "columns 0 is outside"),
+        ({"size": 2048, "columns": 64, "rows": 64}, UsageError, "are more than"),
+        ({"exposure": math.nan}, UsageError, "exposure nan is outside"),
+        ({"base_color": (0.5, 2.0, 0.5)}, UsageError, "base color 0.5 2 0.5 is not"),
+        ({"background": "sky"}, UsageError, "neither environment nor plain"),
+    ],
+)
 def test_what_cannot_be_drawn_is_said(baked, tmp_path, options, error, said):
     with pytest.raises(error, match=said):
         shading.render(baked, tmp_path / "grid.png", **{"for_": "filament", **options})
@@ -406,8 +476,22 @@ def test_files_are_those_of_the_manifest(baked, tmp_path):
         shading.render(tmp_path / "z.json", tmp_path / "new.png", for_="filament")
 
 
-@pytest.mark.parametrize("text", ["", "1 2 3", "(1, 2, 3)\n" * 8, "(1, 2, nan)\n" * 9, "(1, 2, 1e999)\n" * 9, "{",
-                                  "[1]", '{"x": 1}', '{"x": [1, 2, "3x"]}', "\xff", "(1, 2, 3)\n" * 9000])
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "1 2 3",
+        "(1, 2, 3)\n" * 8,
+        "(1, 2, nan)\n" * 9,
+        "(1, 2, 1e999)\n" * 9,
+        "{",
+        "[1]",
+        '{"x": 1}',
+        '{"x": [1, 2, "3x"]}',
+        "\xff",
+        "(1, 2, 3)\n" * 9000,
+    ],
+)
 def test_a_text_that_holds_no_harmonics_is_refused(text, tmp_path):
     path = tmp_path / "x_sh.txt"
     path.write_text(text, "latin-1")

@@ -1,4 +1,5 @@
 """The truth beside an engine's picture: closed forms, another quadrature, and the integral by hand."""
+
 from __future__ import annotations
 
 import json
@@ -65,13 +66,18 @@ def noise(rows: int, lamps: int = 0, seed: int = 3):
 # ------------------------------------------------------------------------------------------------- samples
 
 
-@pytest.mark.parametrize(("ndf", "roughness"), [("ggx", 0.2), ("ggx", 0.5), ("ggx", 1.0), ("beckmann", 0.5),
-                                                ("gtr:gamma=1.5", 0.6), (None, 0.0)])
+@pytest.mark.parametrize(
+    ("ndf", "roughness"),
+    [("ggx", 0.2), ("ggx", 0.5), ("ggx", 1.0), ("beckmann", 0.5), ("gtr:gamma=1.5", 0.6), (None, 0.0)],
+)
 def test_the_samples_weigh_what_the_albedo_is(device: Device, ndf, roughness):
     """The white furnace of the sampling itself, before the albedo takes its place: against quadrature. 16 384 lattice
     points leave 1e-3 where n·v is .1 and normals, not those that v sees, are drawn."""
-    found = term(diffuse="burley:albedo=.8,roughness=.4") if ndf is None else \
-        term(ndf=ndf, roughness=roughness, fresnel="schlick", fresnel_f0=np.array([0.0, 1.0]), fresnel_f90=1.0)
+    found = (
+        term(diffuse="burley:albedo=.8,roughness=.4")
+        if ndf is None
+        else term(ndf=ndf, roughness=roughness, fresnel="schlick", fresnel_f0=np.array([0.0, 1.0]), fresnel_f90=1.0)
+    )
     truth, some = Truth(device, environment(np.ones((4, 8, 3), np.float32))), points(64)
     _, weights = truth.sums(found, some, 1 << 14, truth.rest)
     own = {name: v for name, v in found.parameters.items()}
@@ -105,8 +111,16 @@ def test_samples_read_as_much_as_they_stand_for(device: Device, ndf: str, monkey
 def test_constant_light_gives_the_albedo(device: Device):
     some = points(32)
     got, E = Truth(device, environment(np.full((4, 8, 3), 0.7, np.float32))).reflected(schlick(0.3), some, 256)
-    want = integrate("albedo", ndf="ggx", fresnel="schlick", alpha=0.3, f0=np.array([0.04, 1.0]), f90=1.0,
-                     NoV=some.NoV[:, None], device=device).values
+    want = integrate(
+        "albedo",
+        ndf="ggx",
+        fresnel="schlick",
+        alpha=0.3,
+        f0=np.array([0.04, 1.0]),
+        f90=1.0,
+        NoV=some.NoV[:, None],
+        device=device,
+    ).values
     assert np.abs(got - 0.7 * want[..., None]).max() < 2e-6  # the albedos' own tolerance
     assert np.abs(E - want).max() < 2e-6
 
@@ -130,7 +144,7 @@ def test_the_integral_by_hand(device: Device, alpha: float):
         L = np.repeat(texels[i // cuts], cuts, 0) * (math.sin(t) * area)
         for k in range(6):
             for s, F0 in enumerate((0.04, 1.0)):
-                want[k, s] += ggx(d, some.n[:, k:k + 1], some.v[:, k:k + 1], alpha, F0) @ L
+                want[k, s] += ggx(d, some.n[:, k : k + 1], some.v[:, k : k + 1], alpha, F0) @ L
     got, _ = truth.reflected(schlick(alpha), some, 1 << 14)
     # Texels of 5.6° are edges for the samples: half a percent where the lobe is as narrow as one.
     assert np.abs(got / want - 1).max() < 6e-3, (got, want)
@@ -189,8 +203,9 @@ def test_quadrature_agrees_at_points_of_a_lit_room(device: Device):
     """The certificate: another method (`radiance.py`) on a small image with lamps, within the tolerance asked for."""
     truth, some = Truth(device, noise(64, lamps=12, seed=8)), points(200, seed=11)
     for roughness in (0.25, 0.7):
-        found = term(ndf="ggx", roughness=roughness, fresnel="schlick", fresnel_f0=np.array([0.04, 1.0]),
-                     fresnel_f90=1.0)
+        found = term(
+            ndf="ggx", roughness=roughness, fresnel="schlick", fresnel_f0=np.array([0.04, 1.0]), fresnel_f90=1.0
+        )
         count, estimate = truth.samples(found, some, 1e-2)
         assert estimate <= 1e-2
         got, _ = truth.reflected(found, some, count)
@@ -204,8 +219,9 @@ def test_quadrature_agrees_in_real_environments(device: Device, environments):
     for path in environments:
         truth, some = Truth(device, environment(path)), points(400, seed=4)
         for roughness in (1 / 6, 0.5, 1.0):
-            found = term(ndf="ggx", roughness=roughness, fresnel="schlick", fresnel_f0=np.array([0.04, 1.0]),
-                         fresnel_f90=1.0)
+            found = term(
+                ndf="ggx", roughness=roughness, fresnel="schlick", fresnel_f0=np.array([0.04, 1.0]), fresnel_f90=1.0
+            )
             count, estimate = truth.samples(found, some, 1e-2)
             assert estimate <= 1e-2, (path, roughness)
             got, _ = truth.reflected(found, some, count)
@@ -236,8 +252,12 @@ def test_a_far_disc_is_punctual(device: Device):
     """Of radius ε at a distance far over it: c = L ε²/d² from its centre; the sphere's own place counts."""
     some = Points(np.array([[0.0, 0.6], [0.0, 0.0], [1.0, 0.8]]), np.broadcast_to(UP, (3, 2)))
     black = Truth(device, environment(np.zeros((4, 8, 3), np.float32)))
-    lit = Spheres(black, Material(), some, ["disc:center_x=0,center_y=3,center_z=4,normal_x=0,normal_y=-3,normal_z=-4,"
-                                           "radius=.01,radiance=1e4"]).lit(schlick(0.5))
+    lit = Spheres(
+        black,
+        Material(),
+        some,
+        ["disc:center_x=0,center_y=3,center_z=4,normal_x=0,normal_y=-3,normal_z=-4,radius=.01,radiance=1e4"],
+    ).lit(schlick(0.5))
     to = np.array([[0.0], [3.0], [4.0]]) - some.n
     far = np.linalg.norm(to, axis=0)
     to = to / far
@@ -281,9 +301,25 @@ def test_white_spheres_in_truth(baked, device: Device):
 
     index, cover, n = shading.sphere(32)
     for again in (False, True):
-        row = shown(baked, str(baked / "white.json"), "--for", "filament", "-o", str(baked / "w.exr"), "--truth",
-                    str(baked / "white.exr"), "--size", "32", "--columns", "3", "--rows", "2", "--certify", "2",
-                    *(["--multiscatter"] if again else []))
+        row = shown(
+            baked,
+            str(baked / "white.json"),
+            "--for",
+            "filament",
+            "-o",
+            str(baked / "w.exr"),
+            "--truth",
+            str(baked / "white.exr"),
+            "--size",
+            "32",
+            "--columns",
+            "3",
+            "--rows",
+            "2",
+            "--certify",
+            "2",
+            *(["--multiscatter"] if again else []),
+        )
         got = layers(baked / "w.exr")["truth"].reshape(2, 32, 3, 32, 3).swapaxes(1, 2).reshape(2, 3, -1, 3)
         got = got[:, :, index[cover == 1]]
         NoV = n[2, cover == 1]
@@ -297,26 +333,44 @@ def test_white_spheres_in_truth(baked, device: Device):
 
 
 def test_the_difference_is_what_it_says(baked):
-    common = [str(baked / "noise.json"), "--for", "filament", "--truth", str(baked / "noise.exr"), "--size", "24",
-              "--columns", "2", "--rows", "2", "--certify", "0", "--background", "plain"]
+    common = [
+        str(baked / "noise.json"),
+        "--for",
+        "filament",
+        "--truth",
+        str(baked / "noise.exr"),
+        "--size",
+        "24",
+        "--columns",
+        "2",
+        "--rows",
+        "2",
+        "--certify",
+        "0",
+        "--background",
+        "plain",
+    ]
     row = shown(baked, *common, "-o", str(baked / "n.exr"))
     first = (baked / "n.exr").read_bytes()
     got = layers(baked / "n.exr")
     luminance = got["truth"] @ np.array([0.2126, 0.7152, 0.0722])
-    inside = (np.abs(got["difference"]).sum(-1) > 0)
+    inside = np.abs(got["difference"]).sum(-1) > 0
     want = (got["engine"] - got["truth"]) / luminance[..., None]
     centre = np.zeros(inside.shape, bool)
     for i in (12, 36):
         for j in (12, 36):
-            centre[i - 6:i + 6, j - 6:j + 6] = True
+            centre[i - 6 : i + 6, j - 6 : j + 6] = True
     assert inside[centre].all() and not inside[0].any()
     assert np.abs(want - got["difference"])[centre].max() < 1e-5
     assert row["error"] is None and row["certificate"] == [] and row["samples"][0] == 0 and 0 < row["median"] < 1
     shown(baked, *common, "-o", str(baked / "n.exr"))
     assert (baked / "n.exr").read_bytes() == first
     # The engine's layer is the picture that is drawn without the truth.
-    CliRunner().invoke(cli, ["render", *common[:3], "-o", str(baked / "alone.png"), *common[5:11], "--background",
-                             "plain", "--force"], catch_exceptions=False)
+    CliRunner().invoke(
+        cli,
+        ["render", *common[:3], "-o", str(baked / "alone.png"), *common[5:11], "--background", "plain", "--force"],
+        catch_exceptions=False,
+    )
     from whitefurnace.rendering.shading import srgb
 
     alone = read_image(baked / "alone.png").pixels
@@ -325,22 +379,51 @@ def test_the_difference_is_what_it_says(baked):
 
 def test_three_panels_with_a_scale(baked):
     pytest.importorskip("matplotlib")
-    row = shown(baked, str(baked / "noise.json"), "--for", "raw", "-o", str(baked / "p.png"), "--truth",
-                str(baked / "noise.exr"), "--size", "64", "--columns", "3", "--rows", "1", "--certify", "1",
-                "--light", "punctual:NoL=.7,color=1", "--diffuse", "oren_nayar:sigma=.4", "--metal", "schlick:gold",
-                "--dielectric", "dielectric:ior=1.5")
+    row = shown(
+        baked,
+        str(baked / "noise.json"),
+        "--for",
+        "raw",
+        "-o",
+        str(baked / "p.png"),
+        "--truth",
+        str(baked / "noise.exr"),
+        "--size",
+        "64",
+        "--columns",
+        "3",
+        "--rows",
+        "1",
+        "--certify",
+        "1",
+        "--light",
+        "punctual:NoL=.7,color=1",
+        "--diffuse",
+        "oren_nayar:sigma=.4",
+        "--metal",
+        "schlick:gold",
+        "--dielectric",
+        "dielectric:ior=1.5",
+    )
     pixels = read_image(baked / "p.png").pixels
     assert pixels.shape[0] > 3 * 64 and pixels.shape[1] >= 3 * 64
     assert row["scale"] in (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
     assert any("both pictures" in notice for notice in row["notices"])
 
 
-@pytest.mark.parametrize(("options", "said"), [
-    (["--truth", "white.exr"], "is not the image that"), (["--tolerance", ".1"], "give the image of the bake"),
-    (["--truth", "noise.exr", "--tolerance", "2"], "outside"), (["--truth", "noise.exr", "--certify", "-1"], "outside"),
-    (["--truth", "noise.exr", "--light", "spot"], "unknown light"), (["--truth", "none.exr"], "none.exr"),
-    (["--truth", "noise.exr", "--ndf", "ggx_anisotropic:alpha_x=.1,alpha_y=.2"], "anisotropic"),
-    (["--truth", "noise.exr", "-o", "x.jpg"], "no name of a picture")])
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--truth", "white.exr"], "is not the image that"),
+        (["--tolerance", ".1"], "give the image of the bake"),
+        (["--truth", "noise.exr", "--tolerance", "2"], "outside"),
+        (["--truth", "noise.exr", "--certify", "-1"], "outside"),
+        (["--truth", "noise.exr", "--light", "spot"], "unknown light"),
+        (["--truth", "none.exr"], "none.exr"),
+        (["--truth", "noise.exr", "--ndf", "ggx_anisotropic:alpha_x=.1,alpha_y=.2"], "anisotropic"),
+        (["--truth", "noise.exr", "-o", "x.jpg"], "no name of a picture"),
+    ],
+)
 def test_what_is_refused_is_said(baked, options, said, monkeypatch):
     monkeypatch.chdir(baked)
     command = ["render", "noise.json", "--for", "raw", *([] if "-o" in options else ["-o", "r.exr"]), *options]

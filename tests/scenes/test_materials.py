@@ -1,4 +1,5 @@
 """Scenes: what a glTF's materials hold, what they need of a bake, and what happens to files that are broken."""
+
 from __future__ import annotations
 
 import base64
@@ -33,6 +34,7 @@ from whitefurnace.scenes.materials import PROPERTIES, Scene, read_scene
 
 pytest.importorskip("pygltflib")
 
+
 def scene_of(tmp_path: Path, *materials: dict[str, Any], **more: Any) -> Scene:
     return read_scene(written(tmp_path / "scene.gltf", document(list(materials), **more)))
 
@@ -63,10 +65,22 @@ SPECIFIED = [
     ("transmission", "transmission", "transmissionFactor", "transmissionTexture", "R", False),
     ("thickness", "volume", "thicknessFactor", "thicknessTexture", "G", False),
     ("iridescence", "iridescence", "iridescenceFactor", "iridescenceTexture", "R", False),
-    ("diffuse_transmission", "diffuse_transmission", "diffuseTransmissionFactor", "diffuseTransmissionTexture", "A",
-     False),
-    ("diffuse_transmission_color", "diffuse_transmission", "diffuseTransmissionColorFactor",
-     "diffuseTransmissionColorTexture", "RGB", True),
+    (
+        "diffuse_transmission",
+        "diffuse_transmission",
+        "diffuseTransmissionFactor",
+        "diffuseTransmissionTexture",
+        "A",
+        False,
+    ),
+    (
+        "diffuse_transmission_color",
+        "diffuse_transmission",
+        "diffuseTransmissionColorFactor",
+        "diffuseTransmissionColorTexture",
+        "RGB",
+        True,
+    ),
 ]
 CODES = {"R": 51, "G": 102, "B": 153, "A": 204}
 
@@ -81,10 +95,12 @@ def placed(where: str, values: dict[str, Any]) -> dict[str, Any]:
     return pbr(**values) if where == "pbr" else values if not where else with_extension(where, **values)
 
 
-@pytest.mark.parametrize(("name", "where", "factor", "texture", "channels", "srgb"), SPECIFIED,
-                         ids=[row[0] for row in SPECIFIED])
-def test_a_factor_and_a_texture_multiply_in_the_channels_of_the_specification(tmp_path, name, where, factor, texture,
-                                                                              channels, srgb):
+@pytest.mark.parametrize(
+    ("name", "where", "factor", "texture", "channels", "srgb"), SPECIFIED, ids=[row[0] for row in SPECIFIED]
+)
+def test_a_factor_and_a_texture_multiply_in_the_channels_of_the_specification(
+    tmp_path, name, where, factor, texture, channels, srgb
+):
     image = np.broadcast_to(np.array([CODES[c] for c in "RGBA"], np.uint8), (4, 4, 4))
     value = [0.5, 0.75, 1.0] + ([1.0] if name == "base_color" else []) if len(channels) == 3 else 0.5
     scene = scene_of(tmp_path, placed(where, {factor: value, texture: {"index": 0}}), images=[image])
@@ -103,16 +119,41 @@ def test_the_specified_properties_are_those_that_have_a_texture():
 
 
 def test_values_without_textures_and_what_is_default(tmp_path):
-    scene = scene_of(tmp_path, {"extensions": {
-        "KHR_materials_ior": {"ior": 1.33}, "KHR_materials_emissive_strength": {"emissiveStrength": 7},
-        "KHR_materials_volume": {"attenuationDistance": 0.1, "attenuationColor": [0.9, 0.5, 0.1]},
-        "KHR_materials_iridescence": {"iridescenceIor": 1.8, "iridescenceThicknessMaximum": 300},
-        "KHR_materials_dispersion": {"dispersion": 2}, "VENDOR_other": {}}})
+    scene = scene_of(
+        tmp_path,
+        {
+            "extensions": {
+                "KHR_materials_ior": {"ior": 1.33},
+                "KHR_materials_emissive_strength": {"emissiveStrength": 7},
+                "KHR_materials_volume": {"attenuationDistance": 0.1, "attenuationColor": [0.9, 0.5, 0.1]},
+                "KHR_materials_iridescence": {"iridescenceIor": 1.8, "iridescenceThicknessMaximum": 300},
+                "KHR_materials_dispersion": {"dispersion": 2},
+                "VENDOR_other": {},
+            }
+        },
+    )
     m = scene.materials[0]
-    found = {name: m[name].low for name in ("ior", "emissive_strength", "attenuation_distance", "attenuation_color",
-                                            "iridescence_ior", "iridescence_thickness", "dispersion")}
-    assert found == {"ior": (1.33,), "emissive_strength": (7.0,), "attenuation_distance": (0.1,), "dispersion": (2.0,),
-                     "attenuation_color": (0.9, 0.5, 0.1), "iridescence_ior": (1.8,), "iridescence_thickness": (300.0,)}
+    found = {
+        name: m[name].low
+        for name in (
+            "ior",
+            "emissive_strength",
+            "attenuation_distance",
+            "attenuation_color",
+            "iridescence_ior",
+            "iridescence_thickness",
+            "dispersion",
+        )
+    }
+    assert found == {
+        "ior": (1.33,),
+        "emissive_strength": (7.0,),
+        "attenuation_distance": (0.1,),
+        "dispersion": (2.0,),
+        "attenuation_color": (0.9, 0.5, 0.1),
+        "iridescence_ior": (1.8,),
+        "iridescence_thickness": (300.0,),
+    }
     # glTF's defaults: white, a metal, rough; n = 1.5
     assert (m["base_color"].low, m["metalness"].low, m["roughness"].low) == ((1, 1, 1), (1,), (1,))
     assert m["base_color"].given == "default" and m.unread == ("VENDOR_other",)
@@ -123,18 +164,27 @@ def test_values_without_textures_and_what_is_default(tmp_path):
 def test_the_film_of_iridescence_runs_from_minimum_to_maximum(tmp_path):
     image = np.zeros((2, 2, 3), np.uint8)
     image[0, :, 1] = 255
-    scene = scene_of(tmp_path, with_extension("iridescence", iridescenceThicknessMinimum=200,
-                                              iridescenceThicknessMaximum=500,
-                                              iridescenceThicknessTexture={"index": 0}), images=[image])
+    scene = scene_of(
+        tmp_path,
+        with_extension(
+            "iridescence",
+            iridescenceThicknessMinimum=200,
+            iridescenceThicknessMaximum=500,
+            iridescenceThicknessTexture={"index": 0},
+        ),
+        images=[image],
+    )
     assert (scene.materials[0]["iridescence_thickness"].low, scene.materials[0]["iridescence_thickness"].high) == (
-        (200.0,), (500.0,))
+        (200.0,),
+        (500.0,),
+    )
 
 
 def ramp(rows: int = 64, columns: int = 256) -> np.ndarray:
     """Roughness (G) k/255 in column k, metalness (B) 0 above and 255 below."""
     image = np.zeros((rows, columns, 3), np.uint8)
     image[..., 1] = np.arange(columns)
-    image[rows // 2:, :, 2] = 255
+    image[rows // 2 :, :, 2] = 255
     return image
 
 
@@ -159,7 +209,8 @@ def test_only_what_triangles_use_of_an_image_counts(tmp_path, case):
     if case == "by a transform":
         uv = WHOLE
         material["pbrMetallicRoughness"]["metallicRoughnessTexture"]["extensions"] = {
-            "KHR_texture_transform": {"scale": [0.25, 1]}}
+            "KHR_texture_transform": {"scale": [0.25, 1]}
+        }
     if case == "sixteen bits":
         image = image.astype(np.uint16) * 257
     if case == "wrapped":
@@ -187,8 +238,12 @@ def test_extent_cameras_and_only_what_stands_in_the_scene(tmp_path):
     doc = document([{"name": "seen"}, {"name": "not seen"}])
     doc["meshes"] = [{"primitives": [p]} for p in doc["meshes"][0]["primitives"]]
     c = math.sqrt(0.5)
-    doc["nodes"] = [{"children": [1, 2], "translation": [0, 3, 0], "scale": [2, 2, 2]},
-                    {"mesh": 0, "rotation": [0, c, 0, c]}, {"camera": 0, "translation": [0, 0, 5]}, {"mesh": 1}]
+    doc["nodes"] = [
+        {"children": [1, 2], "translation": [0, 3, 0], "scale": [2, 2, 2]},
+        {"mesh": 0, "rotation": [0, c, 0, c]},
+        {"camera": 0, "translation": [0, 0, 5]},
+        {"mesh": 1},
+    ]
     doc["nodes"][1]["children"] = [4]
     doc["nodes"].append({"camera": 0})
     doc["cameras"] = [{"type": "perspective", "perspective": {"yfov": 0.7, "znear": 0.1}}]
@@ -224,8 +279,11 @@ def verdicts(found: Needs) -> dict[str, bool | None]:
 
 MIRROR = {"name": "mirror", **pbr(metallicFactor=1, roughnessFactor=0)}
 CHALK = {"name": "chalk", **pbr(metallicFactor=0, roughnessFactor=1)}
-CLOTH = {"name": "cloth", **pbr(metallicFactor=0, roughnessFactor=0.8),
-         **with_extension("sheen", sheenColorFactor=[1, 1, 1], sheenRoughnessFactor=0.5)}
+CLOTH = {
+    "name": "cloth",
+    **pbr(metallicFactor=0, roughnessFactor=0.8),
+    **with_extension("sheen", sheenColorFactor=[1, 1, 1], sheenRoughnessFactor=0.5),
+}
 
 
 def test_a_mirror_needs_the_image_and_no_diffuse_light(tmp_path):
@@ -235,7 +293,7 @@ def test_a_mirror_needs_the_image_and_no_diffuse_light(tmp_path):
     assert not said["irradiance"] and not said["irradiance harmonics"] and said["split-sum table"]
     assert found.options == {"only_levels": "0-0", "without": ["irradiance", "sh"]}
     assert found.nbytes == 6 * 256 * 256 * 12 + 128 * 128 * 8
-    assert found.full_nbytes == sum(6 * (256 >> k)**2 * 12 for k in range(5)) + 6 * 32 * 32 * 12 + 128 * 128 * 8
+    assert found.full_nbytes == sum(6 * (256 >> k) ** 2 * 12 for k in range(5)) + 6 * 32 * 32 * 12 + 128 * 128 * 8
 
 
 def test_chalk_needs_diffuse_light_and_the_last_level(tmp_path):
@@ -276,12 +334,15 @@ def test_a_clear_coat_reads_at_its_own_roughness(tmp_path):
     assert found.chain == found.full
 
 
-@pytest.mark.parametrize(("engine", "wanted"), [
-    ("raw", False),      # single scattering: a metal has no diffuse part
-    ("filament", False),
-    ("three", True),     # [FdezAguera2019] gives what is scattered again as diffuse light, of metals too
-    ("babylon", True),   # mixes α of the diffuse light into what is reflected
-])
+@pytest.mark.parametrize(
+    ("engine", "wanted"),
+    [
+        ("raw", False),  # single scattering: a metal has no diffuse part
+        ("filament", False),
+        ("three", True),  # [FdezAguera2019] gives what is scattered again as diffuse light, of metals too
+        ("babylon", True),  # mixes α of the diffuse light into what is reflected
+    ],
+)
 def test_whether_a_rough_metal_needs_diffuse_light_is_the_engines(tmp_path, engine, wanted):
     gold = {"name": "gold", **pbr(baseColorFactor=[1, 0.78, 0.34, 1], roughnessFactor=0.6)}
     found = needs(scene_of(tmp_path, gold), ENGINES[engine])
@@ -293,22 +354,38 @@ def test_black_and_clear_need_no_diffuse_light(tmp_path):
     black = pbr(baseColorFactor=[0, 0, 0, 1], metallicFactor=0, roughnessFactor=0.4)
     clear = {**pbr(metallicFactor=0, roughnessFactor=0), **with_extension("transmission", transmissionFactor=1)}
     assert "irradiance" in needs(scene_of(tmp_path, black, clear), ENGINES["raw"]).without
-    leaf = {**pbr(baseColorFactor=[0, 0, 0, 1], metallicFactor=0),
-            **with_extension("diffuse_transmission", diffuseTransmissionFactor=0.5)}
+    leaf = {
+        **pbr(baseColorFactor=[0, 0, 0, 1], metallicFactor=0),
+        **with_extension("diffuse_transmission", diffuseTransmissionFactor=0.5),
+    }
     assert "irradiance" not in needs(scene_of(tmp_path, leaf), ENGINES["raw"]).without
 
 
 def test_what_no_table_gives_is_said(tmp_path):
     strange = {"name": "strange", "emissiveFactor": [1, 1, 1], **pbr(metallicFactor=0, roughnessFactor=0.3)}
-    strange |= {"extensions": {
-        "KHR_materials_iridescence": {"iridescenceFactor": 1}, "KHR_materials_transmission": {"transmissionFactor": 1},
-        "KHR_materials_volume": {"thicknessFactor": 1, "attenuationDistance": 2}, "KHR_materials_ior": {"ior": 1.4},
-        "KHR_materials_dispersion": {"dispersion": 1}, "KHR_materials_anisotropy": {"anisotropyStrength": 0.5},
-        "KHR_materials_emissive_strength": {"emissiveStrength": 5}, "VENDOR_x": {}}}
+    strange |= {
+        "extensions": {
+            "KHR_materials_iridescence": {"iridescenceFactor": 1},
+            "KHR_materials_transmission": {"transmissionFactor": 1},
+            "KHR_materials_volume": {"thicknessFactor": 1, "attenuationDistance": 2},
+            "KHR_materials_ior": {"ior": 1.4},
+            "KHR_materials_dispersion": {"dispersion": 1},
+            "KHR_materials_anisotropy": {"anisotropyStrength": 0.5},
+            "KHR_materials_emissive_strength": {"emissiveStrength": 5},
+            "VENDOR_x": {},
+        }
+    }
     found = needs(scene_of(tmp_path, strange), ENGINES["raw"])
     said = {row.what for row in found.rows if row.needed is None}
-    assert said == {"iridescence", "refraction with volume", "absorption", "dispersion", "anisotropy",
-                    "light of its own", "VENDOR_x"}
+    assert said == {
+        "iridescence",
+        "refraction with volume",
+        "absorption",
+        "dispersion",
+        "anisotropy",
+        "light of its own",
+        "VENDOR_x",
+    }
     assert found.tables == ({"kind": "glass", "output": "glass_1.4.npy", "size": 32, "set": ["ior=1.4"]},)
 
 
@@ -385,13 +462,20 @@ def run(*arguments: str) -> tuple[int, str]:
 
 
 def test_what_is_needed_is_baked_and_nothing_else(tmp_path):
-    glass = {"name": "glass", **pbr(metallicFactor=0, roughnessFactor=1.0),
-             **with_extension("transmission", transmissionFactor=1)}
+    glass = {
+        "name": "glass",
+        **pbr(metallicFactor=0, roughnessFactor=1.0),
+        **with_extension("transmission", transmissionFactor=1),
+    }
     file = written(tmp_path / "s.gltf", document([glass]))
     code, said = run(str(file), "--environment", "demo", "-o", str(tmp_path / "out"))
     assert code == 0 and "bake --only-levels 4-4 --without irradiance,sh" in said
     assert sorted(p.relative_to(tmp_path / "out").as_posix() for p in (tmp_path / "out").rglob("*") if p.is_file()) == [
-        "demo.json", "glass_1.5.npy", "glass_1.5.npy.json", "raw/demo.npz"]
+        "demo.json",
+        "glass_1.5.npy",
+        "glass_1.5.npy.json",
+        "raw/demo.npz",
+    ]
     with np.load(tmp_path / "out/raw/demo.npz") as held:
         assert sorted(held) == ["dfg", "error", "rmse", "roughness", "specular_4", "worst"]
         assert len(held["roughness"]) == 5 and held["specular_4"].shape == (6, 16, 16, 3)
@@ -431,10 +515,17 @@ def test_paths_of_a_job_are_relative_to_it(tmp_path, monkeypatch):
     assert Path(item.source).samefile(name) and "mine.toml" in item.recipe
 
 
-@pytest.mark.parametrize(("arguments", "message"), [
-    (("-o", "x"), "give --environment"), (("--job", "x.toml"), "give --environment"),
-    (("-o", "x", "--job", "y.toml", "--environment", "demo"), "not both"), (("--for", "raw,exr"), "one engine"),
-    (("--for", "filamnet"), "did you mean 'filament'"), (("--job", "x.txt", "--environment", "demo"), ".toml file")])
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("-o", "x"), "give --environment"),
+        (("--job", "x.toml"), "give --environment"),
+        (("-o", "x", "--job", "y.toml", "--environment", "demo"), "not both"),
+        (("--for", "raw,exr"), "one engine"),
+        (("--for", "filamnet"), "did you mean 'filament'"),
+        (("--job", "x.txt", "--environment", "demo"), ".toml file"),
+    ],
+)
 def test_options_that_cannot_be_meant(tmp_path, arguments, message):
     file = written(tmp_path / "s.gltf", document([CHALK]))
     with pytest.raises(UsageError, match=message.replace(".", r"\.")):
@@ -443,8 +534,10 @@ def test_options_that_cannot_be_meant(tmp_path, arguments, message):
 
 def test_json_rows_are_json(tmp_path):
     file = written(tmp_path / "s.gltf", document([{**CLOTH, **with_extension("volume", thicknessFactor=1)}]))
-    rows = [json.loads(line, parse_constant=lambda name: pytest.fail(name)) for line in
-            run(str(file), "--json")[1].splitlines()]
+    rows = [
+        json.loads(line, parse_constant=lambda name: pytest.fail(name))
+        for line in run(str(file), "--json")[1].splitlines()
+    ]
     assert [row["event"] for row in rows][:2] == ["scene", "material"] and rows[-1]["event"] == "needs"
     assert rows[-1]["bytes"] < rows[-1]["usual_bytes"] and rows[1]["values"]["attenuation_distance"]["low"] == [None]
 
@@ -458,10 +551,20 @@ def test_without_pygltflib_one_sentence_names_the_extra(tmp_path, monkeypatch, c
     assert left.value.code == 5 and said.count("\n") == 1 and "whitefurnace[scene]" in said
 
 
-@pytest.mark.parametrize("options", [{"without": "irradiance,nothing"}, {"table": 0}, {"table": 64},
-                                     {"without": ["sh"], "for_": "gltf"}, {"only_levels": "1-2", "for_": "three"},
-                                     {"only_levels": "3-5"}, {"only_levels": "2-1"}, {"only_levels": "1"},
-                                     {"only_levels": "1-2", "fit": "read"}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"without": "irradiance,nothing"},
+        {"table": 0},
+        {"table": 64},
+        {"without": ["sh"], "for_": "gltf"},
+        {"only_levels": "1-2", "for_": "three"},
+        {"only_levels": "3-5"},
+        {"only_levels": "2-1"},
+        {"only_levels": "1"},
+        {"only_levels": "1-2", "fit": "read"},
+    ],
+)
 def test_what_cannot_be_left_out(options):
     with pytest.raises(UsageError):
         baking.plan(BakeRequest(["demo"], "x", **options))
@@ -478,6 +581,7 @@ def broken(change: Callable[[dict[str, Any]], object]) -> dict[str, Any]:
 
 def put(*path: Any) -> Callable[[dict[str, Any]], object]:
     """Sets the value at a path of keys, the last of `path`; the value ... removes it."""
+
     def change(doc: dict[str, Any]) -> None:
         *keys, last, value = path
         at: Any = doc
@@ -487,6 +591,7 @@ def put(*path: Any) -> Callable[[dict[str, Any]], object]:
             del at[last]
         else:
             at[last] = value
+
     return change
 
 
@@ -503,38 +608,52 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "a missing image": (put("images", 0, "uri", "gone.png"), "image 0, of a material, is missing"),
     "an image that is none": (put("images", 0, "uri", uri(b"hello")), "neither PNG, JPEG nor WebP"),
     "bad base64": (put("images", 0, "uri", "data:image/png;base64,@@@@"), "base64"),
-    "no index of a texture": (put("materials", 0, "pbrMetallicRoughness", "metallicRoughnessTexture", {}),
-                              "the index of"),
-    "a texture that is not there": (put("materials", 0, "pbrMetallicRoughness", "metallicRoughnessTexture",
-                                        {"index": 7}), "0 to 0 is allowed"),
+    "no index of a texture": (
+        put("materials", 0, "pbrMetallicRoughness", "metallicRoughnessTexture", {}),
+        "the index of",
+    ),
+    "a texture that is not there": (
+        put("materials", 0, "pbrMetallicRoughness", "metallicRoughnessTexture", {"index": 7}),
+        "0 to 0 is allowed",
+    ),
     "an image that is not there": (put("textures", 0, "source", 9), "0 to 0 is allowed"),
     "a sampler that is not there": (put("textures", 0, "sampler", 0), "there is none"),
     "a material that is not there": (put("meshes", 0, "primitives", 0, "material", 1), "0 to 0 is allowed"),
     "a mesh that is not there": (put("nodes", 0, "mesh", -1), "0 to 0 is allowed"),
     "a roughness that is NaN": (put("materials", 0, "pbrMetallicRoughness", "roughnessFactor", math.nan), "finite"),
     "a roughness past 1": (put("materials", 0, "pbrMetallicRoughness", "roughnessFactor", 1.5), "outside [0, 1]"),
-    "a roughness that is a text": (put("materials", 0, "pbrMetallicRoughness", "roughnessFactor", "rough"),
-                                   "not as glTF has them"),
+    "a roughness that is a text": (
+        put("materials", 0, "pbrMetallicRoughness", "roughnessFactor", "rough"),
+        "not as glTF has them",
+    ),
     "a colour of two": (put("materials", 0, "pbrMetallicRoughness", "baseColorFactor", [1, 1]), "has 2 entries"),
     "an ior below 1": (put("materials", 0, "extensions", {"KHR_materials_ior": {"ior": 0.5}}), "0 and 1 or more"),
-    "an attenuation distance of 0": (put("materials", 0, "extensions", {"KHR_materials_volume":
-                                                                        {"attenuationDistance": 0}}), "over 0"),
+    "an attenuation distance of 0": (
+        put("materials", 0, "extensions", {"KHR_materials_volume": {"attenuationDistance": 0}}),
+        "over 0",
+    ),
     "an extension that is a number": (put("materials", 0, "extensions", {"KHR_materials_sheen": 3}), "an object was"),
-    "a texture that is a number": (put("materials", 0, "pbrMetallicRoughness", "metallicRoughnessTexture", 3),
-                                   "not as glTF has them"),
+    "a texture that is a number": (
+        put("materials", 0, "pbrMetallicRoughness", "metallicRoughnessTexture", 3),
+        "not as glTF has them",
+    ),
     "a base that is a number": (put("materials", 0, "pbrMetallicRoughness", 3), "not as glTF has them"),
     "materials that are none": (put("materials", [3]), "an object was expected"),
     "a node that is its own child": (put("nodes", [{"mesh": 0, "children": [0]}]), "its own ancestor"),
-    "cyclic nodes": (put("nodes", [{"children": [1]}, {"children": [2]}, {"mesh": 0, "children": [0]}]),
-                     "its own ancestor"),
+    "cyclic nodes": (
+        put("nodes", [{"children": [1]}, {"children": [2]}, {"mesh": 0, "children": [0]}]),
+        "its own ancestor",
+    ),
     "a cycle beside the scene": (put("nodes", [{"mesh": 0}, {"children": [2]}, {"children": [1]}]), "its own ancestor"),
     "two parents": (put("nodes", [{"children": [1, 2]}, {"children": [2]}, {"mesh": 0}]), "a child of both"),
     "a child that is not there": (put("nodes", 0, "children", [5]), "0 to 0 is allowed"),
     "a scene that is not there": (put("scene", 3), "0 to 0 is allowed"),
     "a scene of a child": (put("nodes", [{"mesh": 0}, {"children": [0]}]), "which is a child of"),
     "a rotation of three": (put("nodes", 0, "rotation", [0, 0, 1]), "has 3 entries"),
-    "a scale that overflows": (put("nodes", [{"scale": [1e200] * 3, "children": [1]},
-                                             {"scale": [1e200] * 3, "mesh": 0}]), "is not finite"),
+    "a scale that overflows": (
+        put("nodes", [{"scale": [1e200] * 3, "children": [1]}, {"scale": [1e200] * 3, "mesh": 0}]),
+        "is not finite",
+    ),
     "an accessor without a type": (put("accessors", 1, "type", ...), "the type of accessor 1 is missing"),
     "coordinates of another type": (put("accessors", 1, "type", "VEC3"), "VEC2 of"),
     "a component that is none": (put("accessors", 1, "componentType", 5130), "componentType 5130"),
@@ -545,8 +664,10 @@ BROKEN: dict[str, tuple[Callable[[dict[str, Any]], object], str]] = {
     "a view beyond its buffer": (put("bufferViews", 1, "byteLength", 1 << 33), "buffer 0 has 92"),
     "a view that is not there": (put("accessors", 1, "bufferView", 3), "0 to 2 is allowed"),
     "indices beyond the vertices": (put("accessors", 2, "bufferView", 0), "go up to"),
-    "indices that are floats": (put("accessors", 2, {"bufferView": 1, "componentType": 5126, "count": 6,
-                                                     "type": "SCALAR"}), "unsigned integers"),
+    "indices that are floats": (
+        put("accessors", 2, {"bufferView": 1, "componentType": 5126, "count": 6, "type": "SCALAR"}),
+        "unsigned integers",
+    ),
     "a box that is inside out": (put("accessors", 0, "min", [2, 2, 2]), "a min above its max"),
     "a camera that is none": (put("nodes", 0, "camera", 0), "there is none"),
     "a mesh without primitives": (put("meshes", 0, "primitives", []), "0 entries"),
@@ -584,12 +705,24 @@ def test_the_command_line_exits_with_3(tmp_path, capsys):
     assert left.value.code == 3 and capsys.readouterr().err.count("\n") == 1
 
 
-@pytest.mark.parametrize("text", [b"", b"{", b"[]", b"null", b"glTF", b"\xff\xfe", b"[" * 200_000, b'{"a":' * 100_000,
-                                  b'{"asset":{"version":"2.0"},"nodes":{}}',
-                                  b'{"asset":{"version":"2.0"},"scene":1e400}',
-                                  struct.pack("<4s2I", b"glTF", 2, 12),
-                                  struct.pack("<4s4I", b"glTF", 2, 1 << 31, 1 << 31, 0x4E4F534A),
-                                  struct.pack("<4s4I", b"glTF", 2, 20, 0xFFFFFFFF, 0x4E4F534A)])
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b"[]",
+        b"null",
+        b"glTF",
+        b"\xff\xfe",
+        b"[" * 200_000,
+        b'{"a":' * 100_000,
+        b'{"asset":{"version":"2.0"},"nodes":{}}',
+        b'{"asset":{"version":"2.0"},"scene":1e400}',
+        struct.pack("<4s2I", b"glTF", 2, 12),
+        struct.pack("<4s4I", b"glTF", 2, 1 << 31, 1 << 31, 0x4E4F534A),
+        struct.pack("<4s4I", b"glTF", 2, 20, 0xFFFFFFFF, 0x4E4F534A),
+    ],
+)
 def test_what_is_no_gltf_is_one_sentence(tmp_path, text):
     file = tmp_path / "s.glb"
     file.write_bytes(text)
@@ -613,7 +746,7 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     made = bytearray(data)
     kind = rng.randrange(4)
     if kind == 0:
-        return bytes(made[:rng.randrange(len(made))])
+        return bytes(made[: rng.randrange(len(made))])
     for _ in range(rng.randrange(1, 8)):
         at = rng.randrange(len(made)) if kind == 1 else rng.randrange(min(len(made), 2500))  # the header and the JSON
         if kind == 3:
@@ -623,8 +756,29 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return bytes(made)
 
 
-VALUES = [None, True, -1, 0, 1, 2.5, 1e300, -1e300, math.inf, math.nan, 1 << 40, 10**400, "", "x", [], {}, [0], [{}],
-          {"index": 0}, [[]], 65536]
+VALUES = [
+    None,
+    True,
+    -1,
+    0,
+    1,
+    2.5,
+    1e300,
+    -1e300,
+    math.inf,
+    math.nan,
+    1 << 40,
+    10**400,
+    "",
+    "x",
+    [],
+    {},
+    [0],
+    [{}],
+    {"index": 0},
+    [[]],
+    65536,
+]
 
 
 def replaced(doc: dict[str, Any], rng: random.Random) -> dict[str, Any]:
@@ -651,8 +805,11 @@ def replaced(doc: dict[str, Any], rng: random.Random) -> dict[str, Any]:
 @pytest.mark.parametrize("count", [150, pytest.param(600, marks=pytest.mark.long)])
 def test_anything_at_all_is_read_or_refused(tmp_path, count):
     rng = random.Random(5)
-    extensions = {f"KHR_materials_{row[1]}": {row[2]: 0.5 if len(row[4]) == 1 else [0.5] * 3, row[3]: {"index": 0}}
-                  for row in SPECIFIED if row[1] not in ("", "pbr")}
+    extensions = {
+        f"KHR_materials_{row[1]}": {row[2]: 0.5 if len(row[4]) == 1 else [0.5] * 3, row[3]: {"index": 0}}
+        for row in SPECIFIED
+        if row[1] not in ("", "pbr")
+    }
     doc = document([{**ROUGH, "extensions": extensions}], [ramp(4, 8)])
     doc["cameras"] = [{"type": "perspective", "perspective": {"yfov": 1, "znear": 1}}]
     doc["nodes"].append({"camera": 0, "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]})

@@ -1,4 +1,5 @@
 """The scale of a scene: what its media ask for, where a pixel's size is from, and the table that follows."""
+
 from __future__ import annotations
 
 import json
@@ -20,9 +21,14 @@ pytest.importorskip("pygltflib")
 
 
 def volume(name: str = "inside", thickness: float = 0.1, **values: Any) -> dict[str, Any]:
-    return {"name": name, "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 0.5}, "extensions": {
-        "KHR_materials_transmission": {"transmissionFactor": 1},
-        "KHR_materials_volume": {"thicknessFactor": thickness, **values}}}
+    return {
+        "name": name,
+        "pbrMetallicRoughness": {"metallicFactor": 0, "roughnessFactor": 0.5},
+        "extensions": {
+            "KHR_materials_transmission": {"transmissionFactor": 1},
+            "KHR_materials_volume": {"thicknessFactor": thickness, **values},
+        },
+    }
 
 
 def matte(name: str) -> dict[str, Any]:
@@ -47,8 +53,9 @@ def with_camera(scene: dict[str, Any], *cameras: tuple[dict[str, Any], list[floa
 
 
 def test_a_volume_lets_through_what_its_extension_says(tmp_path):
-    (one,) = judged(scene_of(tmp_path, volume(thickness=0.3, attenuationDistance=0.1,
-                                              attenuationColor=[0.9, 0.5, 0.25])))
+    (one,) = judged(
+        scene_of(tmp_path, volume(thickness=0.3, attenuationDistance=0.1, attenuationColor=[0.9, 0.5, 0.25]))
+    )
     assert one.judgement is not None and one.judgement.absorption is not None and one.judgement.transport is None
     # Beer's law in the extension's own form: colour^(thickness / distance)
     assert one.judgement.absorption.transmittance == pytest.approx((0.9**3, 0.5**3, 0.25**3), rel=1e-12)
@@ -124,15 +131,19 @@ def test_the_table_is_baked_and_is_in_the_job(tmp_path):
     assert code == 0 and medium["subsurface"] and medium["material"] == "a/../b: c"
     # Nothing else is needed of what is unlit.
     made = sorted(p.name for p in (tmp_path / "out").iterdir())
-    assert made == ["diffusion_a_b_c.npy", "diffusion_a_b_c.npy.json"] == [medium["table"]["output"],
-                                                                         medium["table"]["output"] + ".json"]
+    assert (
+        made
+        == ["diffusion_a_b_c.npy", "diffusion_a_b_c.npy.json"]
+        == [medium["table"]["output"], medium["table"]["output"] + ".json"]
+    )
     table = np.load(tmp_path / "out" / made[0])
     # Over the circle it keeps what arrives, 1/π in the mean: 64 midpoints of n·l see that, weighted 1/√(1 - x²),
     # within 1 % (the ends of the weight).
     x = (np.arange(64) + 0.5) / 32 - 1
     share = np.diff(np.arcsin(np.linspace(-1, 1, 65))) / math.pi
-    assert x.size == table.shape[1] and np.allclose(share @ np.asarray(table, float).swapaxes(0, 1).reshape(64, -1),
-                                                    1 / math.pi, rtol=0.01)
+    assert x.size == table.shape[1] and np.allclose(
+        share @ np.asarray(table, float).swapaxes(0, 1).reshape(64, -1), 1 / math.pi, rtol=0.01
+    )
     job = tmp_path / "job.toml"
     assert run(*wanted, "--job", str(job))[0] == 0
     (item,) = batch.job(job).items
@@ -142,19 +153,35 @@ def test_the_table_is_baked_and_is_in_the_job(tmp_path):
 def test_without_a_scale_nothing_is_judged(tmp_path):
     file = written(tmp_path / "s.gltf", document([volume()]))
     assert not [row for row in run(str(file))[1] if row["event"] == "medium"]
-    assert "no material has a volume" in CliRunner().invoke(
-        cli, ["scene", str(written(tmp_path / "t.gltf", document([matte("a")]))), "--pixel", "1mm"]).stdout
+    assert (
+        "no material has a volume"
+        in CliRunner()
+        .invoke(cli, ["scene", str(written(tmp_path / "t.gltf", document([matte("a")]))), "--pixel", "1mm"])
+        .stdout
+    )
 
 
-@pytest.mark.parametrize(("options", "message"), [
-    (("--pixel", "5"), "has a unit"), (("--pixel", "1mm", "--resolution", "9"), "not both"),
-    (("--resolution", "1080"), "has none: give --pixel"), (("--resolution", "0"), "outside [1, 16384]"),
-    (("--medium", "sikn1"), "did you mean 'skin1'"), (("--medium", "waxx:skin1"), "did you mean 'wax'"),
-    (("--medium", "wax:σa=1/2"), "one number, or three"), (("--medium", "wax:sa=1"), "is not one of"),
-    (("--medium", "wax:σa=x"), "is not a number"), (("--medium", "wax:distance=1m"), "together"),
-    (("--medium", "wax:distance=1m,color=.5,σa=1"), "give σa, or"), (("--medium", "wax:σa=1,σa=2"), "twice"),
-    (("--medium", "wax:skin1", "--medium", "wax:skin2"), "already"), (("--medium", "wax:σs=-1"), "from 0"),
-    (("--medium", "wax:g=1"), "outside (-1, 1)"), (("--medium", "wax:ior=9"), "outside [1, 3]")])
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--pixel", "5"), "has a unit"),
+        (("--pixel", "1mm", "--resolution", "9"), "not both"),
+        (("--resolution", "1080"), "has none: give --pixel"),
+        (("--resolution", "0"), "outside [1, 16384]"),
+        (("--medium", "sikn1"), "did you mean 'skin1'"),
+        (("--medium", "waxx:skin1"), "did you mean 'wax'"),
+        (("--medium", "wax:σa=1/2"), "one number, or three"),
+        (("--medium", "wax:sa=1"), "is not one of"),
+        (("--medium", "wax:σa=x"), "is not a number"),
+        (("--medium", "wax:distance=1m"), "together"),
+        (("--medium", "wax:distance=1m,color=.5,σa=1"), "give σa, or"),
+        (("--medium", "wax:σa=1,σa=2"), "twice"),
+        (("--medium", "wax:skin1", "--medium", "wax:skin2"), "already"),
+        (("--medium", "wax:σs=-1"), "from 0"),
+        (("--medium", "wax:g=1"), "outside (-1, 1)"),
+        (("--medium", "wax:ior=9"), "outside [1, 3]"),
+    ],
+)
 def test_what_is_wrong_is_one_sentence_before_anything_else(tmp_path, capsys, options, message):
     file = written(tmp_path / "s.gltf", document([matte("wax")]))
     with pytest.raises(SystemExit) as ended:

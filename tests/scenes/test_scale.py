@@ -1,4 +1,5 @@
 """Scale: the slides' examples with published coefficients, and how far light goes against a random walk."""
+
 from __future__ import annotations
 
 import json
@@ -13,10 +14,19 @@ from whitefurnace.errors import UsageError
 from whitefurnace.scenes.scale import MEDIA, UNITS, Medium, difference, footprint, judge, length, length_text, medium
 
 REFLECTANCE = {  # [Jensen2001, figure 5]
-    "apple": (0.85, 0.84, 0.53), "chicken1": (0.31, 0.15, 0.10), "chicken2": (0.32, 0.16, 0.10),
-    "cream": (0.98, 0.90, 0.73), "ketchup": (0.16, 0.01, 0.00), "marble": (0.83, 0.79, 0.75),
-    "potato": (0.77, 0.62, 0.21), "skimmilk": (0.81, 0.81, 0.69), "skin1": (0.44, 0.22, 0.13),
-    "skin2": (0.63, 0.44, 0.34), "spectralon": (1.00, 1.00, 1.00), "wholemilk": (0.91, 0.88, 0.76)}
+    "apple": (0.85, 0.84, 0.53),
+    "chicken1": (0.31, 0.15, 0.10),
+    "chicken2": (0.32, 0.16, 0.10),
+    "cream": (0.98, 0.90, 0.73),
+    "ketchup": (0.16, 0.01, 0.00),
+    "marble": (0.83, 0.79, 0.75),
+    "potato": (0.77, 0.62, 0.21),
+    "skimmilk": (0.81, 0.81, 0.69),
+    "skin1": (0.44, 0.22, 0.13),
+    "skin2": (0.63, 0.44, 0.34),
+    "spectralon": (1.00, 1.00, 1.00),
+    "wholemilk": (0.91, 0.88, 0.76),
+}
 
 
 # ------------------------------------------------------------------------------------------------------ lengths
@@ -32,25 +42,45 @@ def test_lengths_and_pixels() -> None:
     assert footprint(500, ymag=0.25) == pytest.approx(1e-3, rel=1e-14)
 
 
-@pytest.mark.parametrize("text, words", [("0.5", "a length has a unit"), ("1 M", "did you mean 'm'"),
-                                         ("0mm", "above 0"), ("-1mm", "above 0"), ("mm", "above 0"),
-                                         ("1..2mm", "above 0"), ("nan m", "above 0"), ("1e999m", "above 0"),
-                                         ("", "above 0")])
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("0.5", "a length has a unit"),
+        ("1 M", "did you mean 'm'"),
+        ("0mm", "above 0"),
+        ("-1mm", "above 0"),
+        ("mm", "above 0"),
+        ("1..2mm", "above 0"),
+        ("nan m", "above 0"),
+        ("1e999m", "above 0"),
+        ("", "above 0"),
+    ],
+)
 def test_a_wrong_length_is_one_sentence(text: str, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         length(text)
 
 
-@pytest.mark.parametrize("wrong, words", [
-    (lambda: footprint(0, ymag=1), "no pixel"), (lambda: footprint(9), "either yfov"),
-    (lambda: footprint(9, yfov=1), "distance"), (lambda: footprint(9, yfov=4, distance=1), "outside"),
-    (lambda: footprint(9, yfov=1, distance=math.nan), "above 0"), (lambda: judge(MEDIA["water"], -1), "size -1"),
-    (lambda: judge(MEDIA["water"], 1, math.inf), "pixel inf"),
-    (lambda: Medium((1, 2)), "three coefficients"),  # type: ignore[arg-type]
-    (lambda: Medium((0, 0, math.nan)), "three coefficients"), (lambda: Medium((0, 0, 0), (math.inf, 0, 0)), "finite"),
-    (lambda: Medium((0, 0, 0), g=1), "g 1 is outside"), (lambda: Medium((0, 0, 0), ior=0.9), "ior 0.9"),
-    (lambda: Medium.of_volume(0), "not above 0"), (lambda: Medium.of_volume(1, (1, 2, 0)), "from 0 to 1"),
-    (lambda: medium("skin"), "did you mean 'skin")])
+@pytest.mark.parametrize(
+    "wrong, words",
+    [
+        (lambda: footprint(0, ymag=1), "no pixel"),
+        (lambda: footprint(9), "either yfov"),
+        (lambda: footprint(9, yfov=1), "distance"),
+        (lambda: footprint(9, yfov=4, distance=1), "outside"),
+        (lambda: footprint(9, yfov=1, distance=math.nan), "above 0"),
+        (lambda: judge(MEDIA["water"], -1), "size -1"),
+        (lambda: judge(MEDIA["water"], 1, math.inf), "pixel inf"),
+        (lambda: Medium((1, 2)), "three coefficients"),  # type: ignore[arg-type]
+        (lambda: Medium((0, 0, math.nan)), "three coefficients"),
+        (lambda: Medium((0, 0, 0), (math.inf, 0, 0)), "finite"),
+        (lambda: Medium((0, 0, 0), g=1), "g 1 is outside"),
+        (lambda: Medium((0, 0, 0), ior=0.9), "ior 0.9"),
+        (lambda: Medium.of_volume(0), "not above 0"),
+        (lambda: Medium.of_volume(1, (1, 2, 0)), "from 0 to 1"),
+        (lambda: medium("skin"), "did you mean 'skin"),
+    ],
+)
 def test_what_no_medium_is(wrong, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         wrong()
@@ -76,8 +106,14 @@ def test_the_share_is_the_profiles_integral() -> None:
         sigma, z_v = math.sqrt(3 * (1 - single)), 1 + 4 / 3 * (1 + F) / (1 - F)
 
         def R(r: np.ndarray, s: float = sigma, z_v: float = z_v, single: float = single) -> np.ndarray:
-            return single / (4 * np.pi) * sum(z * (s * d + 1) * np.exp(-s * d) / d**3  # type: ignore[no-any-return]
-                                              for z, d in ((1.0, np.hypot(r, 1.0)), (z_v, np.hypot(r, z_v))))
+            return (
+                single
+                / (4 * np.pi)
+                * sum(
+                    z * (s * d + 1) * np.exp(-s * d) / d**3  # type: ignore[no-any-return]
+                    for z, d in ((1.0, np.hypot(r, 1.0)), (z_v, np.hypot(r, z_v)))
+                )
+            )
 
         whole = float(Medium((1 - single,) * 3, (single,) * 3, ior=ior).albedo[0])
         for radius in (0.01, 0.7, 5.0):
@@ -113,8 +149,10 @@ def walk(single: float, ior: float, photons: int, seed: int) -> np.ndarray:
     return np.concatenate(left)
 
 
-@pytest.mark.parametrize("single, ior", [(0.9, 1.0), (0.98, 1.0), (0.7, 1.3), (0.9, 1.3), (0.98, 1.3), (0.995, 1.3),
-                                         (0.98, 1.5), (0.995, 1.5)])
+@pytest.mark.parametrize(
+    "single, ior",
+    [(0.9, 1.0), (0.98, 1.0), (0.7, 1.3), (0.9, 1.3), (0.98, 1.3), (0.995, 1.3), (0.98, 1.5), (0.995, 1.5)],
+)
 def test_the_spread_is_that_of_a_random_walk(single: float, ior: float) -> None:
     """What diffusion theory is off by at the few collisions near the entry: 9 % of the 95 % radius in walks of 40 000
     photons, of which sampling is up to 3 % (5 000 of them leave)."""
@@ -162,29 +200,32 @@ def test_what_is_noticed() -> None:
 # ------------------------------------------------------------------------------------------------- the slides' examples
 
 
-@pytest.mark.parametrize("name, size, pixel, absorption, transport", [
-    # "water does absorb a little light in the red, but it's not noticeable over a few inches"
-    ("water", "3in", "0.1mm", "negligible", "clear"),
-    # "but this absorption is quite significant over distances of dozens of yards"; a pool is seen to be blue
-    ("water", "2.5m", "1mm", "matters", "clear"),
-    ("water", "24yd", "1cm", "matters", "clear"),
-    ("water", "1km", "1m", "opaque", "clear"),
-    # "air doesn't scatter noticeably over a few yards, but it does over a scale of miles"
-    ("air", "3yd", "1mm", "negligible", "clear"),
-    ("air", "3mi", "1m", "negligible", "cloudy"),
-    # "distant skin or marble can use normal rendering techniques", close-up they cannot
-    ("skin1", "20cm", "2cm", "matters", "local"),
-    ("skin2", "20cm", "2cm", "matters", "local"),
-    ("skin1", "20cm", "0.1mm", "matters", "subsurface"),
-    ("skin2", "20cm", "0.1mm", "matters", "subsurface"),
-    ("marble", "2m", "2cm", "matters", "local"),
-    ("marble", "30cm", "0.5mm", "matters", "subsurface"),
-    # An ear before a lamp; a glass of milk from across the room, and at the table; a wet film of milk.
-    ("skin1", "3mm", "0.1mm", "matters", "translucent"),
-    ("wholemilk", "7cm", "1cm", "matters", "local"),
-    ("wholemilk", "7cm", "0.3mm", "matters", "subsurface"),
-    ("wholemilk", "0.1mm", "0.01mm", "negligible", "cloudy"),
-])
+@pytest.mark.parametrize(
+    "name, size, pixel, absorption, transport",
+    [
+        # "water does absorb a little light in the red, but it's not noticeable over a few inches"
+        ("water", "3in", "0.1mm", "negligible", "clear"),
+        # "but this absorption is quite significant over distances of dozens of yards"; a pool is seen to be blue
+        ("water", "2.5m", "1mm", "matters", "clear"),
+        ("water", "24yd", "1cm", "matters", "clear"),
+        ("water", "1km", "1m", "opaque", "clear"),
+        # "air doesn't scatter noticeably over a few yards, but it does over a scale of miles"
+        ("air", "3yd", "1mm", "negligible", "clear"),
+        ("air", "3mi", "1m", "negligible", "cloudy"),
+        # "distant skin or marble can use normal rendering techniques", close-up they cannot
+        ("skin1", "20cm", "2cm", "matters", "local"),
+        ("skin2", "20cm", "2cm", "matters", "local"),
+        ("skin1", "20cm", "0.1mm", "matters", "subsurface"),
+        ("skin2", "20cm", "0.1mm", "matters", "subsurface"),
+        ("marble", "2m", "2cm", "matters", "local"),
+        ("marble", "30cm", "0.5mm", "matters", "subsurface"),
+        # An ear before a lamp; a glass of milk from across the room, and at the table; a wet film of milk.
+        ("skin1", "3mm", "0.1mm", "matters", "translucent"),
+        ("wholemilk", "7cm", "1cm", "matters", "local"),
+        ("wholemilk", "7cm", "0.3mm", "matters", "subsurface"),
+        ("wholemilk", "0.1mm", "0.01mm", "negligible", "cloudy"),
+    ],
+)
 def test_the_slides_examples(name: str, size: str, pixel: str, absorption: str, transport: str) -> None:
     found = judge(medium(name), length(size), length(pixel))
     assert found.absorption is not None and found.transport is not None

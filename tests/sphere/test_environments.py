@@ -121,9 +121,7 @@ def test_six_faces_in_a_folder(tmp_path, names):
 @pytest.mark.parametrize("name", ["horizontal cross", "vertical cross"])
 def test_neighbours_in_a_cross_are_neighbours_on_the_sphere(name):
     (layout,) = (layout for layout in LAYOUTS if layout.name == name)
-    faces = [
-        np.rot90(face, -cell.turns) for face, cell in zip(cube_directions(64), layout.cells, strict=True)
-    ]
+    faces = [np.rot90(face, -cell.turns) for face, cell in zip(cube_directions(64), layout.cells, strict=True)]
     joints = 0
     for a, at in zip(faces, layout.cells, strict=True):
         for b, to in zip(faces, layout.cells, strict=True):
@@ -344,9 +342,7 @@ def test_sources_that_are_no_environment(tmp_path):
     refused(FileError, "a\0b", "null")
 
 
-@pytest.mark.parametrize(
-    "value, shown", [(np.nan, "nan"), (np.inf, "inf"), (-np.inf, "-inf"), (-0.25, "-0.25")]
-)
+@pytest.mark.parametrize("value, shown", [(np.nan, "nan"), (np.inf, "inf"), (-np.inf, "-inf"), (-0.25, "-0.25")])
 @pytest.mark.parametrize("as_file", [False, True])
 def test_the_first_bad_pixel_is_named(tmp_path, value, shown, as_file):
     pixels = np.ones((8, 16, 3), np.float32)

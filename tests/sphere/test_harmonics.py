@@ -1,5 +1,6 @@
 """Spherical harmonics to degree 2: the least irradiance over the sphere, the window that keeps it from going negative,
 and each engine's coefficients, evaluated as that engine's shader does."""
+
 from __future__ import annotations
 
 import itertools
@@ -39,9 +40,19 @@ def written_out(d: np.ndarray) -> np.ndarray:
     theta, phi = np.arccos(np.clip(z, -1, 1)), np.arctan2(y, x)
     s, c = np.sin(theta), np.cos(theta)
     k1, k2 = math.sqrt(3 / (4 * math.pi)), math.sqrt(15 / (4 * math.pi))
-    return np.stack([np.full_like(x, math.sqrt(1 / (4 * math.pi))), k1 * s * np.sin(phi), k1 * c, k1 * s * np.cos(phi),
-                     k2 / 2 * s**2 * np.sin(2 * phi), k2 * s * c * np.sin(phi), k2 / math.sqrt(12) * (3 * c**2 - 1),
-                     k2 * s * c * np.cos(phi), k2 / 2 * s**2 * np.cos(2 * phi)])
+    return np.stack(
+        [
+            np.full_like(x, math.sqrt(1 / (4 * math.pi))),
+            k1 * s * np.sin(phi),
+            k1 * c,
+            k1 * s * np.cos(phi),
+            k2 / 2 * s**2 * np.sin(2 * phi),
+            k2 * s * c * np.sin(phi),
+            k2 / math.sqrt(12) * (3 * c**2 - 1),
+            k2 * s * c * np.cos(phi),
+            k2 / 2 * s**2 * np.cos(2 * phi),
+        ]
+    )
 
 
 def spread(count: int) -> np.ndarray:
@@ -80,9 +91,15 @@ def random_sets(count: int) -> np.ndarray:
     sh[:, 4:] *= 10 ** rng.uniform(-3, 1, (count, 1, 1))
     sh[:, 0] = np.abs(sh[:, 0])
     bright = rng.normal(size=(count // 4, 3, 3))
-    sh[: count // 4] = np.einsum("nkl,nlc->nkc", written_out(
-        (bright / np.linalg.norm(bright, axis=1, keepdims=True)).transpose(1, 0, 2).reshape(3, -1),
-    ).reshape(9, -1, 3).transpose(1, 0, 2), 10 ** rng.uniform(-4, 0, (count // 4, 3, 3)))
+    sh[: count // 4] = np.einsum(
+        "nkl,nlc->nkc",
+        written_out(
+            (bright / np.linalg.norm(bright, axis=1, keepdims=True)).transpose(1, 0, 2).reshape(3, -1),
+        )
+        .reshape(9, -1, 3)
+        .transpose(1, 0, 2),
+        10 ** rng.uniform(-4, 0, (count // 4, 3, 3)),
+    )
     return sh
 
 
@@ -238,8 +255,18 @@ def test_what_cannot_be_windowed_is_refused():
 
 def test_the_option():
     assert [sh_window(f"window={x}") for x in ("auto", "none", "3", "2.5")] == ["auto", "none", 3.0, 2.5]
-    for text in ("auto", "window", "windows=auto", "window=", "window=best", "window=0.5", "window=nan", "window=inf",
-                 "window=-1", "window=1e9"):
+    for text in (
+        "auto",
+        "window",
+        "windows=auto",
+        "window=",
+        "window=best",
+        "window=0.5",
+        "window=nan",
+        "window=inf",
+        "window=-1",
+        "window=1e9",
+    ):
         with pytest.raises(UsageError) as told:
             sh_window(text)
         assert "\n" not in str(told.value) and "window" in str(told.value)
@@ -269,25 +296,54 @@ def test_the_rmse_is_as_by_hand():
 def filament_shader(sh: np.ndarray, n: np.ndarray) -> np.ndarray:
     """Irradiance_SphericalHarmonics of Filament's light_indirect shader, without its max(…, 0)."""
     x, y, z = n[:, :, None]
-    return np.asarray(sh[0] + sh[1] * y + sh[2] * z + sh[3] * x + sh[4] * (y * x) + sh[5] * (y * z)
-                      + sh[6] * (3 * z * z - 1) + sh[7] * (z * x) + sh[8] * (x * x - y * y))
+    return np.asarray(
+        sh[0]
+        + sh[1] * y
+        + sh[2] * z
+        + sh[3] * x
+        + sh[4] * (y * x)
+        + sh[5] * (y * z)
+        + sh[6] * (3 * z * z - 1)
+        + sh[7] * (z * x)
+        + sh[8] * (x * x - y * y)
+    )
 
 
 def babylon_shader(harmonics: np.ndarray, n: np.ndarray) -> np.ndarray:
     """SphericalHarmonics.preScaleForRendering of @babylonjs/core, then computeEnvironmentIrradiance."""
     pi = math.pi
-    constants = np.array([(1 / (4 * pi))**.5, -(3 / (4 * pi))**.5, (3 / (4 * pi))**.5, -(3 / (4 * pi))**.5,
-                          (15 / (4 * pi))**.5, -(15 / (4 * pi))**.5, (5 / (16 * pi))**.5, -(15 / (4 * pi))**.5,
-                          (15 / (16 * pi))**.5])
+    constants = np.array(
+        [
+            (1 / (4 * pi)) ** 0.5,
+            -((3 / (4 * pi)) ** 0.5),
+            (3 / (4 * pi)) ** 0.5,
+            -((3 / (4 * pi)) ** 0.5),
+            (15 / (4 * pi)) ** 0.5,
+            -((15 / (4 * pi)) ** 0.5),
+            (5 / (16 * pi)) ** 0.5,
+            -((15 / (4 * pi)) ** 0.5),
+            (15 / (16 * pi)) ** 0.5,
+        ]
+    )
     return filament_shader(harmonics * constants[:, None], n)  # the same nine terms
 
 
 def babylon_env(p: np.ndarray, n: np.ndarray) -> np.ndarray:
     """SphericalPolynomial.FromArray and SphericalHarmonics.FromPolynomial, as for a .env file."""
     x, y, z, xx, yy, zz, yz, zx, xy = p
-    harmonics = np.stack([
-        xx * 0.376127 + yy * 0.376127 + zz * 0.376126, -y * 0.977204, z * 0.977204, -x * 0.977204, xy * 1.16538,
-        -yz * 1.16538, zz * 1.34567 - xx * 0.672834 - yy * 0.672834, -zx * 1.16538, xx * 1.16538 - yy * 1.16538])
+    harmonics = np.stack(
+        [
+            xx * 0.376127 + yy * 0.376127 + zz * 0.376126,
+            -y * 0.977204,
+            z * 0.977204,
+            -x * 0.977204,
+            xy * 1.16538,
+            -yz * 1.16538,
+            zz * 1.34567 - xx * 0.672834 - yy * 0.672834,
+            -zx * 1.16538,
+            xx * 1.16538 - yy * 1.16538,
+        ]
+    )
     return babylon_shader(math.pi * harmonics, n)
 
 
@@ -367,9 +423,12 @@ def test_a_bake_gives_engines_the_window_and_states_it(device: Device, tmp_path)
     gltf = read_light(tmp_path / "gltf" / "array.gltf").irradiance_sh
     assert env is not None and gltf is not None
     # Texts of nine digits and 15 decimals; an engine's own direction is where it reads the cube.
-    for engine, shade, values in (("filament", filament_shader, np.array([t[:3] for t in triples], float)),
-                                  ("filament", filament_shader, np.array(keys, float).reshape(9, 3)),
-                                  ("babylon", babylon_env, env), ("gltf", babylon_lights_image_based, gltf)):
+    for engine, shade, values in (
+        ("filament", filament_shader, np.array([t[:3] for t in triples], float)),
+        ("filament", filament_shader, np.array(keys, float).reshape(9, 3)),
+        ("babylon", babylon_env, env),
+        ("gltf", babylon_lights_image_based, gltf),
+    ):
         shown = shade(values, np.array(ENGINES[engine].matrix) @ n)
         assert np.abs(shown - irradiance_at(want.values, n)).max() < 1e-8 * np.abs(own).max()
         assert shown.min() > -1e-8 * np.abs(own).max()

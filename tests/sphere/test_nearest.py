@@ -1,4 +1,5 @@
 """The texels nearest some directions, against all of them looked at one by one."""
+
 from __future__ import annotations
 
 import numpy as np
@@ -8,8 +9,11 @@ from whitefurnace.sphere.grids import Shape
 from whitefurnace.sphere.nearest import CORNERS, TEXELS, nearest_texels
 
 
-@pytest.mark.parametrize("shape", [Shape(False, n) for n in (1, 4, 7, 8, 16, 36, 64)]
-                         + [Shape(True, n) for n in (1, 8, 9, 16, 32, 48, 100)], ids=str)
+@pytest.mark.parametrize(
+    "shape",
+    [Shape(False, n) for n in (1, 4, 7, 8, 16, 36, 64)] + [Shape(True, n) for n in (1, 8, 9, 16, 32, 48, 100)],
+    ids=str,
+)
 @pytest.mark.parametrize("targets", [1, 2, 8])
 def test_nearest_of_all(shape: Shape, targets: int) -> None:
     rng = np.random.default_rng([shape.size, targets])

@@ -1,4 +1,5 @@
 """Level 0, the mean of the source over each texel: the kernels against iterated integrals and closed forms."""
+
 from __future__ import annotations
 
 import math
@@ -41,7 +42,8 @@ def assert_means(got: np.ndarray, want: np.ndarray, tolerance: float, context: o
     error = np.abs(got - want) / want
     worst = np.unravel_index(np.argmax(error), error.shape)
     assert np.isfinite(got).all() and error.max() <= tolerance, (
-        f"{context}: texel {worst}, got {got[worst]}, wanted {want[worst]}, error {error.max():.2e} > {tolerance:g}")
+        f"{context}: texel {worst}, got {got[worst]}, wanted {want[worst]}, error {error.max():.2e} > {tolerance:g}"
+    )
 
 
 # A level is stored as float32: half an ulp, 6e-8. A clipped polygon's area is right to 1e-15 of a texel's, or 1e-14 for
@@ -51,17 +53,31 @@ BESIDE_SUN = 1e-5
 
 
 @pytest.mark.parametrize("rotate", [0.0, 37.0, 90.0, -133.7])
-@pytest.mark.parametrize("source, sun", [
-    ((1, 2), None), ((3, 6), (0, 1)), ((17, 34), (3, 20)), ((64, 128), (16, 48)), ((64, 128), (0, 5)),
-    ((64, 128), (63, 127)), ((128, 256), (45, 32)),
-], ids=str)
-def test_latlong_source_on_cubes(device: Device, source: tuple[int, int], sun: tuple[int, int] | None,
-                                 rotate: float) -> None:
+@pytest.mark.parametrize(
+    "source, sun",
+    [
+        ((1, 2), None),
+        ((3, 6), (0, 1)),
+        ((17, 34), (3, 20)),
+        ((64, 128), (16, 48)),
+        ((64, 128), (0, 5)),
+        ((64, 128), (63, 127)),
+        ((128, 256), (45, 32)),
+    ],
+    ids=str,
+)
+def test_latlong_source_on_cubes(
+    device: Device, source: tuple[int, int], sun: tuple[int, int] | None, rotate: float
+) -> None:
     texels = random_texels(source, sun)
     for size in (1, 2, 4, 16, 64):
         index = chosen(Shape(False, size))
-        assert_means(means(device, texels, Shape(False, size), rotate)[index],
-                     truth(texels, Shape(False, size), rotate, index), BESIDE_SUN, (source, size, rotate))
+        assert_means(
+            means(device, texels, Shape(False, size), rotate)[index],
+            truth(texels, Shape(False, size), rotate, index),
+            BESIDE_SUN,
+            (source, size, rotate),
+        )
 
 
 @pytest.mark.parametrize("rotate", [0.0, 37.0])
@@ -70,8 +86,12 @@ def test_latlong_source_on_latlongs(device: Device, source: tuple[int, int], rot
     texels = random_texels(source, (source[0] // 3, source[1] // 2))
     for size in (1, 2, 8, 64):
         index = chosen(Shape(True, size))
-        assert_means(means(device, texels, Shape(True, size), rotate)[index],
-                     truth(texels, Shape(True, size), rotate, index), BESIDE_SUN, (source, size, rotate))
+        assert_means(
+            means(device, texels, Shape(True, size), rotate)[index],
+            truth(texels, Shape(True, size), rotate, index),
+            BESIDE_SUN,
+            (source, size, rotate),
+        )
 
 
 @pytest.mark.parametrize("rotate", [0.0, 37.0, 90.0])
@@ -80,8 +100,12 @@ def test_cube_source_on_cubes(device: Device, size: int, rotate: float) -> None:
     texels = random_texels((6, size, size), (2, size // 2, size // 2) if size > 1 else None)
     for out in (1, 2, 8, 64):
         index = chosen(Shape(False, out))
-        assert_means(means(device, texels, Shape(False, out), rotate)[index],
-                     truth(texels, Shape(False, out), rotate, index), BESIDE_SUN, (size, out, rotate))
+        assert_means(
+            means(device, texels, Shape(False, out), rotate)[index],
+            truth(texels, Shape(False, out), rotate, index),
+            BESIDE_SUN,
+            (size, out, rotate),
+        )
 
 
 @pytest.mark.parametrize("rotate", [0.0, 37.0])
@@ -92,8 +116,12 @@ def test_cube_source_on_latlongs(device: Device, size: int, rotate: float) -> No
     for out in (2, 8, 64):
         index = chosen(Shape(True, out))
         # Chords of Δφ/16 cut (Δφ/16)²/12 off a polar texel: 5e-5 at 8 rows, and 1e-5 of the height elsewhere.
-        assert_means(means(device, texels, Shape(True, out), rotate)[index],
-                     truth(texels, Shape(True, out), rotate, index), 1e-4, (size, out, rotate))
+        assert_means(
+            means(device, texels, Shape(True, out), rotate)[index],
+            truth(texels, Shape(True, out), rotate, index),
+            1e-4,
+            (size, out, rotate),
+        )
 
 
 @pytest.mark.long
@@ -108,9 +136,9 @@ def test_large(device: Device) -> None:
 
 
 @pytest.mark.parametrize("source", [(1, 1), (17, 34), (6, 5, 5), (6, 1, 1)], ids=str)
-@pytest.mark.parametrize("shape", [Shape(False, 1), Shape(False, 16), Shape(False, 64), Shape(True, 2),
-                                   Shape(True, 32)],
-                         ids=str)
+@pytest.mark.parametrize(
+    "shape", [Shape(False, 1), Shape(False, 16), Shape(False, 64), Shape(True, 2), Shape(True, 32)], ids=str
+)
 def test_constant(device: Device, source: tuple[int, ...], shape: Shape) -> None:
     texels = np.full((*source, 3), 1, np.float32)
     # Nothing but float32 storage and sums over areas that cancel to 1e-13.
@@ -121,8 +149,11 @@ def test_constant(device: Device, source: tuple[int, ...], shape: Shape) -> None
 @pytest.mark.parametrize("size", [1, 8, 64])
 def test_energy_is_kept(device: Device, source: tuple[int, ...], size: int) -> None:
     texels = random_texels(source, (0,) * (len(source) - 1) + (3,))
-    omega = (np.repeat(latlong_solid_angles(*source)[:, None], source[1], 1) if len(source) == 2
-             else np.broadcast_to(cube_solid_angles(source[1]), source))
+    omega = (
+        np.repeat(latlong_solid_angles(*source)[:, None], source[1], 1)
+        if len(source) == 2
+        else np.broadcast_to(cube_solid_angles(source[1]), source)
+    )
     shape = Shape(False, size)
     have = shape.solid_angles() @ means(device, texels, shape, 20.0)
     want = np.tensordot(omega, texels.astype(np.float64), omega.ndim)
@@ -217,5 +248,6 @@ def test_float32(without_fp64: Device, source: tuple[int, ...], size: int) -> No
     shape = Shape(False, size)
     index = chosen(shape)
     # Made on the host, as the truth is: what is checked is that it is, and float32 storage.
-    assert_means(means(without_fp64, texels, shape, 37.0)[index], truth(texels, shape, 37.0, index), 1e-7,
-                 (source, size))
+    assert_means(
+        means(without_fp64, texels, shape, 37.0)[index], truth(texels, shape, 37.0, index), 1e-7, (source, size)
+    )

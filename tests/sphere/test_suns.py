@@ -1,5 +1,6 @@
 """The sun taken out of an environment or clamped: direction, size and power of synthetic suns, the energy ledger, and
 what is refused."""
+
 from __future__ import annotations
 
 import json
@@ -95,14 +96,18 @@ def test_a_sun_of_one_texel_and_one_among_black(device: Device) -> None:
     assert sun is not None and sun.texels == 1 and sun.share == pytest.approx(1) and sky.texels.max() == 0
     assert sun.irradiance[0] == pytest.approx(1e6 * latlong_solid_angles(64, 128)[10], rel=1e-6)  # float32 input
     # Lit as engines light it: a white Lambertian facing the light returns c.
-    lit = integrate("radiance", diffuse="lambert", albedo=1.0, light="punctual", NoL=1.0, NoV=0.7, color=sun.c[0],
-                    device=device)
+    lit = integrate(
+        "radiance", diffuse="lambert", albedo=1.0, light="punctual", NoL=1.0, NoV=0.7, color=sun.c[0], device=device
+    )
     assert float(lit.values) == pytest.approx(sun.irradiance[0] / math.pi, rel=1e-6)
 
 
 def test_no_sun_is_no_sun() -> None:
-    for texels in (np.full((16, 32, 3), 2, np.float32), np.zeros((16, 32, 3), np.float32),
-                   np.ones((1, 1, 3), np.float32)):
+    for texels in (
+        np.full((16, 32, 3), 2, np.float32),
+        np.zeros((16, 32, 3), np.float32),
+        np.ones((1, 1, 3), np.float32),
+    ):
         env = environment(texels)
         sky, sun = without_sun(env, "extract")
         assert sun is None and (sky.texels == texels).all() and len(sky.notices) == 1
@@ -116,8 +121,9 @@ def test_clamp_keeps_colour_and_says_what_it_took() -> None:
     level = clamped.texels.mean(-1)
     hot = texels[..., 0] > 100
     assert sun is None and level.max() <= 5 * mean * (1 + 1e-6)
-    np.testing.assert_allclose(clamped.texels[hot] / level[hot][:, None], texels[hot] / texels[hot].mean(-1)[:, None],
-                               rtol=1e-6)
+    np.testing.assert_allclose(
+        clamped.texels[hot] / level[hot][:, None], texels[hot] / texels[hot].mean(-1)[:, None], rtol=1e-6
+    )
     assert (clamped.texels[~hot] == texels[~hot]).all()
     taken = 1 - float((weights * level).sum() / (weights * texels.mean(-1)).sum())
     assert f"{100 * taken:.3g} %" in clamped.notices[0]

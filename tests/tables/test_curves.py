@@ -1,4 +1,5 @@
 """Curves in place of Smith's term and of norms: the headers themselves, evaluated, against quadrature of the NDF."""
+
 from __future__ import annotations
 
 import re
@@ -36,8 +37,10 @@ def test_least_largest_is_chebyshevs() -> None:
     assert abs(want) <= np.abs(found[0] + found[1] * x - np.exp(x)).max() <= 1.03 * abs(want)
 
 
-@pytest.mark.parametrize("ndf, scheme, most", [("ggx", "rational", 7e-3), ("ggx", "linear", 0.08),
-                                               ("beckmann", "rational", 0.04), ("abc", "rational", 0.015)])
+@pytest.mark.parametrize(
+    "ndf, scheme, most",
+    [("ggx", "rational", 7e-3), ("ggx", "linear", 0.08), ("beckmann", "rational", 0.04), ("abc", "rational", 0.015)],
+)
 def test_smith_of_the_header(device: Device, tmp_path: Path, ndf: str, scheme: str, most: float) -> None:
     path = tmp_path / "my_smith.h"
     made = lut("smith", path, ndf=ndf, scheme=scheme, device=device)
@@ -54,8 +57,11 @@ def test_smith_of_the_header(device: Device, tmp_path: Path, ndf: str, scheme: s
 
         c = np.array([3e-3, 0.02, 0.07, 0.2, 0.41, 0.77, 0.99])
         # GGX's closed form; else tanh-sinh, which shares nothing with the kernel.
-        A = entry.reference["area"](np.arccos(c), **given) if ndf == "ggx" else np.array(
-            reference.smith_area(D, np.arcsin(c)))
+        A = (
+            entry.reference["area"](np.arccos(c), **given)
+            if ndf == "ggx"
+            else np.array(reference.smith_area(D, np.arcsin(c)))
+        )
         worst = max(worst, float(np.abs(own["MY_SMITH_G1"](c, r) - c / A).max()))
         V = 1 / (c[:, None] * A + c * (A[:, None] - c[:, None]))
         pair = max(pair, float(np.abs((own["MY_SMITH_V"](c[:, None], c, r) - V) * c * c[:, None]).max()))
@@ -74,10 +80,17 @@ def test_smith_of_one_roughness_and_of_another_parameter(device: Device, tmp_pat
     assert made.manifest["variable"] == "alpha" and "OTHER_G1(c, alpha)" in (tmp_path / "other.h").read_text("utf-8")
 
 
-@pytest.mark.parametrize("ndf, lobe, points", [
-    ("abc", lambda t, b, c: (1 + b * (1 - np.cos(t))) ** -c, [(1, 1), (7, 2), (300, 1.5), (2e4, 3), (1e6, 1.2)]),
-    ("shifted_gamma", lambda t, a, p: np.exp(-np.tan(t) ** 2 / a) * (1 + np.tan(t) ** 2 / a**2) ** -p / np.cos(t) ** 4,
-     [(1e-3, 0), (0.01, 1), (0.1, 2), (0.4, 0.3), (1, 1.7)])])
+@pytest.mark.parametrize(
+    "ndf, lobe, points",
+    [
+        ("abc", lambda t, b, c: (1 + b * (1 - np.cos(t))) ** -c, [(1, 1), (7, 2), (300, 1.5), (2e4, 3), (1e6, 1.2)]),
+        (
+            "shifted_gamma",
+            lambda t, a, p: np.exp(-(np.tan(t) ** 2) / a) * (1 + np.tan(t) ** 2 / a**2) ** -p / np.cos(t) ** 4,
+            [(1e-3, 0), (0.01, 1), (0.1, 2), (0.4, 0.3), (1, 1.7)],
+        ),
+    ],
+)
 def test_norm_of_the_header(device: Device, tmp_path: Path, ndf: str, lobe: Any, points: list[Any]) -> None:
     """1/∫ lobe cos θ dω by Gauss panels in log θ, the lobe as the header's comment has it."""
     path = tmp_path / "n.h"
@@ -97,13 +110,15 @@ def test_norm_of_the_header(device: Device, tmp_path: Path, ndf: str, lobe: Any,
 
 def test_norm_of_a_range_and_a_file(device: Device, tmp_path: Path) -> None:
     """A finer tolerance takes a higher degree; one parameter; a lobe of one's own, cos^k, whose norm is (k + 2)/2π."""
-    made = lut("norm", tmp_path / "n.npy", axes={"b": (10, 1e3, 24, "log")}, ndf="abc:c=2", tolerance=1e-4,
-               device=device)
+    made = lut(
+        "norm", tmp_path / "n.npy", axes={"b": (10, 1e3, 24, "log")}, ndf="abc:c=2", tolerance=1e-4, device=device
+    )
     coarse = lut("norm", tmp_path / "c.npy", axes={"b": (10, 1e3, 24, "log")}, ndf="abc:c=2", device=device)
     assert made.manifest["degree"] > coarse.manifest["degree"] and made.manifest["error"] <= 1e-4
     (tmp_path / "lobe.clh").write_text("real ndf_lobe_D(real cos_m, real k) { return pow(cos_m, k); }\n")
-    made = lut("norm", tmp_path / "l.h", ndf=str(tmp_path / "lobe.clh"), axes={"k": (1, 16, 16)}, tolerance=1e-3,
-               device=device)
+    made = lut(
+        "norm", tmp_path / "l.h", ndf=str(tmp_path / "lobe.clh"), axes={"k": (1, 16, 16)}, tolerance=1e-3, device=device
+    )
     k, own = np.linspace(1, 16, 7), macros(tmp_path / "l.h")["L_NORM"]
     assert np.abs(own(k) / ((k + 2) / (2 * np.pi)) - 1).max() <= made.manifest["error"] + 1e-5
 
@@ -111,12 +126,13 @@ def test_norm_of_a_range_and_a_file(device: Device, tmp_path: Path) -> None:
 def test_refusals(device: Device, tmp_path: Path) -> None:
     ask: Any = lambda kind, name="t.h", **more: lut(kind, tmp_path / name, device=device, **more)  # noqa: E731
     for error, words, kind, more in (
-            (UsageError, "as coefficients, to .h or .npy", "smith", {"name": "t.exr"}),
-            (UnsupportedError, "another", "smith", {"masking": "kelemen"}),
-            (UnsupportedError, "isotropic", "smith", {"ndf": "ggx_anisotropic"}),
-            (UnsupportedError, "one parameter more", "smith", {"ndf": "abc", "axes": {"b": (1, 9, 4), "c": (1, 2, 4)}}),
-            (UnsupportedError, "has a plain one", "norm", {"ndf": "ggx"}),
-            (UsageError, "leave out --fit", "smith", {"fit": "bilinear"})):
+        (UsageError, "as coefficients, to .h or .npy", "smith", {"name": "t.exr"}),
+        (UnsupportedError, "another", "smith", {"masking": "kelemen"}),
+        (UnsupportedError, "isotropic", "smith", {"ndf": "ggx_anisotropic"}),
+        (UnsupportedError, "one parameter more", "smith", {"ndf": "abc", "axes": {"b": (1, 9, 4), "c": (1, 2, 4)}}),
+        (UnsupportedError, "has a plain one", "norm", {"ndf": "ggx"}),
+        (UsageError, "leave out --fit", "smith", {"fit": "bilinear"}),
+    ):
         with pytest.raises(error, match=words):
             ask(kind, **more)
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,5 @@
 """The split-sum table: the kernel with the azimuth in closed form against other forms, and tables as they are read."""
+
 from __future__ import annotations
 
 import json
@@ -18,6 +19,7 @@ from whitefurnace.tables.axes import Axis, axis
 
 def pair_by_tanh_sinh(NoV: float, alpha: float) -> np.ndarray:
     """(scale, bias) over light directions, by another rule and with D and G in other forms than the kernel's."""
+
     def D(theta: np.ndarray) -> np.ndarray:  # [Walter2007, eq. 33] in the tangent
         with np.errstate(over="ignore", divide="ignore"):
             t = np.tan(theta)
@@ -119,8 +121,10 @@ def read_by_hand(table: np.ndarray, u: np.ndarray, r: np.ndarray) -> np.ndarray:
         x, y = (min(max(c, 0), len(table) - 1) for c in (x, y))
         i, j = min(int(x), len(table) - 2), min(int(y), len(table) - 2)
         a, b = x - i, y - j
-        found.append((1 - b) * ((1 - a) * table[j, i] + a * table[j, i + 1]) +
-                     b * ((1 - a) * table[j + 1, i] + a * table[j + 1, i + 1]))
+        found.append(
+            (1 - b) * ((1 - a) * table[j, i] + a * table[j, i + 1])
+            + b * ((1 - a) * table[j + 1, i] + a * table[j + 1, i + 1])
+        )
     return np.array(found)
 
 
@@ -148,14 +152,17 @@ def test_a_fitted_table_as_read(device: Device, tmp_path: Path) -> None:
     assert made.axes[0] == Axis("NoV", 0, 1, 64, "sqrt")
 
 
-@pytest.mark.parametrize("options, words", [
-    ({"fit": "bilnear"}, "bilinear"),
-    ({"fit": "bilinear", "NoV": 0.5}, "two axes"),
-    ({"as_read": True, "size": 1024}, "512"),
-    ({"axes": {"NoV": "sqrt"}, "NoV": 0.5}, "no default axis"),
-    ({"axes": {"NoV": "log"}}, "log"),
-    ({"scheme": "turquin"}, "unknown scheme 'turquin'"),
-])
+@pytest.mark.parametrize(
+    "options, words",
+    [
+        ({"fit": "bilnear"}, "bilinear"),
+        ({"fit": "bilinear", "NoV": 0.5}, "two axes"),
+        ({"as_read": True, "size": 1024}, "512"),
+        ({"axes": {"NoV": "sqrt"}, "NoV": 0.5}, "no default axis"),
+        ({"axes": {"NoV": "log"}}, "log"),
+        ({"scheme": "turquin"}, "unknown scheme 'turquin'"),
+    ],
+)
 def test_refusals(tmp_path: Path, options: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         lut("dfg", tmp_path / "t.npy", **options)

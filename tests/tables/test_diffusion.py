@@ -1,4 +1,5 @@
 """Pre-integrated diffusion: against integrals over the cylinder by other rules, energy, limits, units."""
+
 from __future__ import annotations
 
 import itertools
@@ -26,12 +27,18 @@ def made(path: Path, **options: Any) -> np.ndarray:
 
 def ratio(q: Any, theta: float, width: float) -> float:
     """∫ q(x) max(cos(θ + x), 0) dx / ∫ q dx over -π … π by adaptive Gauss-Kronrod between kinks and q's middle."""
+
     def whole(f: Any) -> float:
-        ends = sorted({-math.pi, math.pi, 0.0, *(s * width * by for s in (-1, 1) for by in (0.01, 0.3, 3, 20)
-                                               if width * by < math.pi),
-                       *(x for x in (math.pi / 2 - theta, -math.pi / 2 - theta) if abs(x) < math.pi)})
-        return sum(quad(f, a, b, epsabs=1e-13, epsrel=1e-12, limit=200)[0]
-                   for a, b in itertools.pairwise(ends))
+        ends = sorted(
+            {
+                -math.pi,
+                math.pi,
+                0.0,
+                *(s * width * by for s in (-1, 1) for by in (0.01, 0.3, 3, 20) if width * by < math.pi),
+                *(x for x in (math.pi / 2 - theta, -math.pi / 2 - theta) if abs(x) < math.pi),
+            }
+        )
+        return sum(quad(f, a, b, epsabs=1e-13, epsrel=1e-12, limit=200)[0] for a, b in itertools.pairwise(ends))
 
     return whole(lambda x: q(x) * max(math.cos(theta + x), 0.0)) / whole(q)
 
@@ -55,8 +62,14 @@ def test_skin_is_the_published_sum_of_gaussians(tmp_path: Path, curvature: float
 def test_burley_is_integrated_over_a_cylinder(tmp_path: Path, curvature: float) -> None:
     """R itself over the surface, along the axis too: y = x sinh t takes its 1/r. 1e-7 of two nested rules."""
     d = 1.3 / (1.85 - 0.6 + 7 * abs(0.6 - 0.8) ** 3)
-    table = made(tmp_path, scheme="burley", axes={"NoL": (-1, 1, 5)}, curvature=curvature,
-                 parameters={"albedo": 0.6, "mfp": 1.3}, precision=64)
+    table = made(
+        tmp_path,
+        scheme="burley",
+        axes={"NoL": (-1, 1, 5)},
+        curvature=curvature,
+        parameters={"albedo": 0.6, "mfp": 1.3},
+        precision=64,
+    )
 
     def q(x: float) -> float:
         r = abs(2 * math.sin(x / 2) / curvature)
@@ -64,8 +77,18 @@ def test_burley_is_integrated_over_a_cylinder(tmp_path: Path, curvature: float) 
             return 0.0
         # Where the exponent is over 40 nothing is left.
         most = math.acosh(max(1.0, 120 * d / r))
-        return 2 * quad(lambda t: (math.exp(-r * math.cosh(t) / d) + math.exp(-r * math.cosh(t) / (3 * d))) /
-                        (8 * math.pi * d), 0, most, epsabs=1e-12, epsrel=1e-10)[0] if most else 0.0
+        return (
+            2
+            * quad(
+                lambda t: (math.exp(-r * math.cosh(t) / d) + math.exp(-r * math.cosh(t) / (3 * d))) / (8 * math.pi * d),
+                0,
+                most,
+                epsabs=1e-12,
+                epsrel=1e-10,
+            )[0]
+            if most
+            else 0.0
+        )
 
     for k, c in enumerate(np.linspace(-1, 1, 5)):
         want = ratio(q, math.acos(c), d * curvature)
@@ -82,13 +105,17 @@ def test_a_mediums_dipole_is_integrated_over_a_cylinder(tmp_path: Path, curvatur
     z_v = z_r + 4 * (1 + F) / (1 - F) / (3 * (a + s))
 
     def R(r: float) -> float:
-        return sum(z * (sigma * d + 1) * math.exp(-sigma * d) / d**3 for z, d in
-                   ((z_r, math.hypot(r, z_r)), (z_v, math.hypot(r, z_v))))
+        return sum(
+            z * (sigma * d + 1) * math.exp(-sigma * d) / d**3
+            for z, d in ((z_r, math.hypot(r, z_r)), (z_v, math.hypot(r, z_v)))
+        )
 
     def q(x: float) -> float:
         r = abs(2 * math.sin(x / 2) / curvature)
-        return 2 * sum(quad(lambda y: R(math.hypot(r, y)), *ends, epsabs=1e-12, epsrel=1e-10)[0]
-                       for ends in ((0, 1), (1, 10), (10, 300)))
+        return 2 * sum(
+            quad(lambda y: R(math.hypot(r, y)), *ends, epsabs=1e-12, epsrel=1e-10)[0]
+            for ends in ((0, 1), (1, 10), (10, 300))
+        )
 
     for k, c in enumerate(np.linspace(-1, 1, 5)):
         assert table[0, k, 2] == pytest.approx(ratio(q, math.acos(c), z_r * curvature), abs=1e-7), c
@@ -99,8 +126,13 @@ def test_nothing_is_lost(tmp_path: Path, scheme: str) -> None:
     """What a circle reflects is what it receives: the mean of D is that of max(cos θ, 0), 1/π. Of a smooth function of
     period 2π the trapezoidal rule is exact: D's harmonics beyond 256 are below 1e-12 where it is as round as here."""
     n = 129
-    table = made(tmp_path, scheme=scheme, axes={"NoL": (-1, 1, n, "angle"), "curvature": (2, 20, 4, "log")},
-                 precision=64, parameters={"albedo": 0.8} if scheme == "burley" else {})
+    table = made(
+        tmp_path,
+        scheme=scheme,
+        axes={"NoL": (-1, 1, n, "angle"), "curvature": (2, 20, 4, "log")},
+        precision=64,
+        parameters={"albedo": 0.8} if scheme == "burley" else {},
+    )
     weights = np.full(n, 1.0)
     weights[[0, -1]] = 0.5
     mean = np.einsum("rck,c->rk", table, weights / (n - 1))
@@ -129,10 +161,17 @@ def test_flat_and_small_bodies(tmp_path: Path) -> None:
 def test_lengths_scale_and_media_are_their_coefficients(tmp_path: Path) -> None:
     """Twice the mean free path at half the curvature is the same; a medium by name and by coefficients, and Burley's
     profile by coefficients and by albedo and path, to the last digits of float64."""
-    one = made(tmp_path, scheme="burley", size=16, parameters={"albedo": 0.8}, axes={"curvature": (0.1, 4, 8)},
-               precision=64)
-    two = made(tmp_path, scheme="burley", size=16, parameters={"albedo": 0.8, "mfp": 2}, precision=64,
-               axes={"curvature": (0.05, 2, 8)})
+    one = made(
+        tmp_path, scheme="burley", size=16, parameters={"albedo": 0.8}, axes={"curvature": (0.1, 4, 8)}, precision=64
+    )
+    two = made(
+        tmp_path,
+        scheme="burley",
+        size=16,
+        parameters={"albedo": 0.8, "mfp": 2},
+        precision=64,
+        axes={"curvature": (0.05, 2, 8)},
+    )
     assert np.abs(one - two).max() < 1e-12 and (one[..., 0] == one[..., 2]).all()
     medium = MEDIA["skin1"]
     named = made(tmp_path, scheme="skin1", size=16, precision=64)
@@ -146,8 +185,10 @@ def test_lengths_scale_and_media_are_their_coefficients(tmp_path: Path) -> None:
     # Channels differ, and so do the profiles: the boundary keeps light in.
     assert np.ptp(named, axis=-1).max() > 0.05 and np.abs(named - burley).max() > 0.02
     # Even scattering of the same σs (1 - g).
-    one, two = (made(tmp_path, scheme="dipole", size=8, parameters={"absorption": 0.1, "scattering": s, "g": g},
-                     precision=64) for s, g in ((1.0, 0.0), (4.0, 0.75)))
+    one, two = (
+        made(tmp_path, scheme="dipole", size=8, parameters={"absorption": 0.1, "scattering": s, "g": g}, precision=64)
+        for s, g in ((1.0, 0.0), (4.0, 0.75))
+    )
     assert np.abs(one - two).max() < 1e-12
 
 
@@ -165,17 +206,22 @@ def test_it_needs_no_device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
 def test_refusals(tmp_path: Path) -> None:
     ask: Any = lambda **more: lut("diffusion", tmp_path / "t.npy", size=8, **more)  # noqa: E731
     for error, words, more in (
-            (UsageError, "did you mean 'skin", {"scheme": "skinn"}), (UnsupportedError, "no ndf", {"ndf": "ggx"}),
-            (UnsupportedError, "no ndf", {"fresnel": "schlick"}), (UsageError, "no parameters", {"albedo": 0.5}),
-            (UsageError, "needs absorption", {"scheme": "dipole"}), (UsageError, "no parameter 'albedo'", {
-                "scheme": "dipole", "albedo": 0.5}), (UsageError, "one or the other", {"scheme": "burley"}),
-            (UsageError, "one or the other", {"scheme": "burley", "albedo": 0.5, "absorption": 1}),
-            (UsageError, "did you mean 'albedo'", {"scheme": "burley", "albdo": 0.5}),
-            (UsageError, "needs scattering", {"scheme": "burley", "absorption": 1}),
-            (UsageError, "outside", {"scheme": "burley", "albedo": 1.5}),
-            (UsageError, "no diffusion", {"scheme": "burley", "absorption": 1, "scattering": 0}),
-            (UsageError, "one number", {"scheme": "burley", "axes": {"albedo": (0, 1, 4)}}),
-            (UsageError, "NoL -2", {"axes": {"NoL": (-2, 1, 4)}}), (UsageError, "from 0", {"curvature": -1}),
-            (UsageError, "EXR holds|an axis at least", {"NoL": 1, "curvature": 1})):
+        (UsageError, "did you mean 'skin", {"scheme": "skinn"}),
+        (UnsupportedError, "no ndf", {"ndf": "ggx"}),
+        (UnsupportedError, "no ndf", {"fresnel": "schlick"}),
+        (UsageError, "no parameters", {"albedo": 0.5}),
+        (UsageError, "needs absorption", {"scheme": "dipole"}),
+        (UsageError, "no parameter 'albedo'", {"scheme": "dipole", "albedo": 0.5}),
+        (UsageError, "one or the other", {"scheme": "burley"}),
+        (UsageError, "one or the other", {"scheme": "burley", "albedo": 0.5, "absorption": 1}),
+        (UsageError, "did you mean 'albedo'", {"scheme": "burley", "albdo": 0.5}),
+        (UsageError, "needs scattering", {"scheme": "burley", "absorption": 1}),
+        (UsageError, "outside", {"scheme": "burley", "albedo": 1.5}),
+        (UsageError, "no diffusion", {"scheme": "burley", "absorption": 1, "scattering": 0}),
+        (UsageError, "one number", {"scheme": "burley", "axes": {"albedo": (0, 1, 4)}}),
+        (UsageError, "NoL -2", {"axes": {"NoL": (-2, 1, 4)}}),
+        (UsageError, "from 0", {"curvature": -1}),
+        (UsageError, "EXR holds|an axis at least", {"NoL": 1, "curvature": 1}),
+    ):
         with pytest.raises(error, match=words):
             ask(**more)

@@ -1,4 +1,5 @@
 """Tables of energy: the furnace by an independent quadrature, the three schemes, sheen."""
+
 from __future__ import annotations
 
 from dataclasses import replace
@@ -25,11 +26,17 @@ def lost_by_1d(NoV: np.ndarray, alpha: float) -> np.ndarray:
     return 1 - reference.ggx_albedo_1d(NoV, np.full(len(NoV), alpha), 120, 2)[0]
 
 
-@pytest.mark.parametrize("n, axes", [
-    pytest.param(16, {}, id="centres"), pytest.param(32, {}, id="centres of 32", marks=pytest.mark.long),
-    pytest.param(32, {"NoV": "sqrt"}, id="sqrt", marks=pytest.mark.long)])
-def test_kulla_conty_comes_out_of_the_furnace_at_one(device: Device, tmp_path: Path, n: int,
-                                                     axes: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    "n, axes",
+    [
+        pytest.param(16, {}, id="centres"),
+        pytest.param(32, {}, id="centres of 32", marks=pytest.mark.long),
+        pytest.param(32, {"NoV": "sqrt"}, id="sqrt", marks=pytest.mark.long),
+    ],
+)
+def test_kulla_conty_comes_out_of_the_furnace_at_one(
+    device: Device, tmp_path: Path, n: int, axes: dict[str, str]
+) -> None:
     """∫ (f + f_ms)(n·l) dω = 1 to 1e-4 at texel centres, f and E(l) by the 1-D form, the rest from the table."""
     made = lut("energy", tmp_path / "e.npy", size=n, axes=axes, device=device)
     table = np.load(tmp_path / "e.npy").astype(np.float64)
@@ -54,8 +61,10 @@ def test_the_other_schemes_say_how_far_they_are(device: Device, tmp_path: Path) 
     found = {}
     for scheme in ("turquin", "fdez_aguera"):
         path = tmp_path / f"{scheme}.npy"
-        found[scheme] = (np.load(path) if lut("energy", path, size=n, scheme=scheme, device=device) else None,
-                         lut("energy", path, size=n, scheme=scheme, device=device).manifest)
+        found[scheme] = (
+            np.load(path) if lut("energy", path, size=n, scheme=scheme, device=device) else None,
+            lut("energy", path, size=n, scheme=scheme, device=device).manifest,
+        )
     E = np.stack([1 - lost_by_1d(centres(n), r**2) for r in centres(n)])
     table, told = found["turquin"]
     # The 1-D form has 1e-7 here; 1/E - 1 has as much, E ≥ .5.
@@ -83,8 +92,13 @@ def test_sheen(device: Device, tmp_path: Path) -> None:
         def D(theta: np.ndarray, alpha: float = alpha) -> np.ndarray:
             return entry.reference["D"](theta, alpha=alpha)  # type: ignore[no-any-return]
 
-        want = reference.albedo_by_tanh_sinh(D, smith.reference["V"], lambda c: 1.0,
-                                             lambda up, D=D: reference.smith_area(D, up), float(centres(16)[column]))
+        want = reference.albedo_by_tanh_sinh(
+            D,
+            smith.reference["V"],
+            lambda c: 1.0,
+            lambda up, D=D: reference.smith_area(D, up),
+            float(centres(16)[column]),
+        )
         # The tolerance asked for, doubled: the statement holds float32's rounding too.
         assert abs(table[row, column, 0] - want) <= 2e-5, (row, column, want)
     x, w = reference.gauss(48)
@@ -116,7 +130,7 @@ def test_fresnel_average(device: Device, tmp_path: Path) -> None:
             path = tmp_path / f"{name}{k}.npy"
             ior = axis or (1 / n[k], 1.0, 2)
             made = lut("fresnel_average", path, fresnel="dielectric", axes={"ior": ior}, precision=64, device=device)
-            values += np.load(path)[0].tolist()[:None if axis else 1]
+            values += np.load(path)[0].tolist()[: None if axis else 1]
             assert made.manifest["error"] <= 1e-11
         sides.append(np.array(values))
     # Gauss panels, halved down to 2⁻³⁰ at the critical angle.

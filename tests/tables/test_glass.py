@@ -1,4 +1,5 @@
 """Tables of rough glass: against the BTDF over directions, in closed form, by reciprocity, in the smooth limit."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -21,8 +22,9 @@ def table(path: Path, device: Device, **options: Any) -> tuple[np.ndarray, dict[
     return np.load(path / "g.npy").astype(np.float64), made.manifest
 
 
-def at(path: Path, device: Device, NoV: tuple[float, float, int], alpha: float, ior: float,
-       **options: Any) -> np.ndarray:
+def at(
+    path: Path, device: Device, NoV: tuple[float, float, int], alpha: float, ior: float, **options: Any
+) -> np.ndarray:
     """(nv, 2) along n·v at one α and index, by the kernel's own n where it is below 1."""
     scheme, index = ("entering", ior) if ior >= 1 else ("leaving", 1 / ior)
     told = table(path, device, axes={"NoV": (*NoV, "linear")}, alpha=alpha, ior=index, scheme=scheme, **options)[0]
@@ -114,9 +116,20 @@ def test_as_much_goes_in_as_comes_out(device: Device, tmp_path: Path, ndf: str) 
         for r in (0.2, 0.9):
             total = []
             for scheme in ("entering", "leaving"):
-                made, _ = glass(scheme, False, ndf=chosen("ndf", ndf), masking=chosen("masking", "smith"),
-                                fresnel=chosen("fresnel", "dielectric"), out=None, precision=64, tolerance=1e-8,
-                                device=device, NoV=mu, alpha=r**2, ior=ior)
+                made, _ = glass(
+                    scheme,
+                    False,
+                    ndf=chosen("ndf", ndf),
+                    masking=chosen("masking", "smith"),
+                    fresnel=chosen("fresnel", "dielectric"),
+                    out=None,
+                    precision=64,
+                    tolerance=1e-8,
+                    device=device,
+                    NoV=mu,
+                    alpha=r**2,
+                    ior=ior,
+                )
                 total.append(float(made.values[:, 1] @ weight))
             # What 28 nodes a panel leave at r = .2, where T rises within .04 of the critical cosine.
             assert abs(total[0] - ior**2 * total[1]) <= 2e-5, (ior, r, total)
@@ -143,12 +156,14 @@ def test_the_statement_holds(device: Device, tmp_path: Path, ndf: str, scheme: s
 
 def test_refusals(device: Device, tmp_path: Path) -> None:
     ask: Any = lambda **more: lut("glass", tmp_path / "t.npy", size=4, device=device, **more)  # noqa: E731
-    for error, words, more in ((UnsupportedError, "each direction alone", {"masking": "kelemen"}),
-                               (UnsupportedError, "isotropic", {"ndf": "ggx_anisotropic"}),
-                               (UnsupportedError, "dielectric", {"fresnel": "schlick:gold"}),
-                               (UsageError, "did you mean 'leaving'", {"scheme": "leavin"}),
-                               (UsageError, "outside", {"ior": 9}),
-                               (UsageError, "f0 scale needs ends above 0", {"axes": {"ior": (-1, 3, 4, "f0")}})):
+    for error, words, more in (
+        (UnsupportedError, "each direction alone", {"masking": "kelemen"}),
+        (UnsupportedError, "isotropic", {"ndf": "ggx_anisotropic"}),
+        (UnsupportedError, "dielectric", {"fresnel": "schlick:gold"}),
+        (UsageError, "did you mean 'leaving'", {"scheme": "leavin"}),
+        (UsageError, "outside", {"ior": 9}),
+        (UsageError, "f0 scale needs ends above 0", {"axes": {"ior": (-1, 3, 4, "f0")}}),
+    ):
         with pytest.raises(error, match=words):
             ask(**more)
     with pytest.raises(UsageError, match="EXR holds two axes"):

@@ -1,4 +1,5 @@
 """Kinds of table: each describes itself, and a new one is one module that touches nothing else."""
+
 from __future__ import annotations
 
 import ast
@@ -77,8 +78,10 @@ class CoatAverage(Kind):
 KINDS = (CoatAverage(),)
 '''
 
-WITH_FOLDER = ("import sys\nfrom whitefurnace.tables import kinds\nkinds.__path__.append(sys.argv.pop(1))\n"
-               "from whitefurnace.cli import main\nmain(sys.argv[1:])\n")
+WITH_FOLDER = (
+    "import sys\nfrom whitefurnace.tables import kinds\nkinds.__path__.append(sys.argv.pop(1))\n"
+    "from whitefurnace.cli import main\nmain(sys.argv[1:])\n"
+)
 """Runs the command line with one more folder in which kinds are looked for."""
 
 
@@ -90,9 +93,14 @@ def shell_with_new_kind(tmp_path: Path) -> Callable[..., str]:
     (folder / "coat_average.py").write_text(NEW_KIND, "utf-8")
 
     def run(*arguments: str, code: int = 0) -> str:
-        done = subprocess.run([sys.executable, "-c", WITH_FOLDER, str(folder), *arguments], capture_output=True,
-                              text=True, encoding="utf-8", cwd=tmp_path,
-                              env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONIOENCODING": "utf-8"})
+        done = subprocess.run(
+            [sys.executable, "-c", WITH_FOLDER, str(folder), *arguments],
+            capture_output=True,
+            text=True,
+            encoding="utf-8",
+            cwd=tmp_path,
+            env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1", "PYTHONIOENCODING": "utf-8"},
+        )
         assert done.returncode == code, done.stderr
         return done.stdout if code == 0 else done.stderr
 
@@ -118,7 +126,7 @@ def test_a_new_kind_is_one_module(tmp_path: Path, shell_with_new_kind: Callable[
     assert "did you mean 'coat_average'?" in shell("lut", "coat_avrage", "-o", "u.npy", code=1)
     assert "did you mean 'inside'?" in shell("lut", "coat_average", "-o", "u.npy", "--scheme", "insid", code=1)
     values = np.load(tmp_path / "t.npy")
-    assert values.shape == (1, 8, 2) and values.sum(-1) == pytest.approx(1, abs=1e-6) and values[0, 0, 0] < .1
+    assert values.shape == (1, 8, 2) and values.sum(-1) == pytest.approx(1, abs=1e-6) and values[0, 0, 0] < 0.1
 
 
 def test_it_is_gone_with_its_module() -> None:
@@ -136,8 +144,12 @@ def test_every_integral_and_module_has_its_kind() -> None:
 
 
 def test_media_are_schemes() -> None:
-    assert kind("diffusion").schemes == ("skin", "burley", "dipole",
-                                         *(name for name in MEDIA if name not in ("water", "air")))
+    assert kind("diffusion").schemes == (
+        "skin",
+        "burley",
+        "dipole",
+        *(name for name in MEDIA if name not in ("water", "air")),
+    )
 
 
 def test_schemes_are_refused_by_name() -> None:
@@ -156,8 +168,10 @@ def test_generic_code_names_no_kind() -> None:
 
 
 def test_kinds_are_listed_without_numpy() -> None:
-    code = ("import sys\nfrom whitefurnace.tables.kinds import listed\nlisted()\n"
-            "sys.exit(str({'numpy', 'pyopencl', 'OpenImageIO'} & set(sys.modules)).replace('set()', '') or 0)")
+    code = (
+        "import sys\nfrom whitefurnace.tables.kinds import listed\nlisted()\n"
+        "sys.exit(str({'numpy', 'pyopencl', 'OpenImageIO'} & set(sys.modules)).replace('set()', '') or 0)"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

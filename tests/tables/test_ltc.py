@@ -1,5 +1,6 @@
 """Linearly transformed cosines: distributions, polygons and misplaced energy against float64 NumPy on nodes of its own,
 limits in closed form, the figures of both schemes, and how engines read the table."""
+
 from __future__ import annotations
 
 import json
@@ -194,8 +195,7 @@ def test_the_figures(made: Any) -> None:
 
 @pytest.mark.long
 def test_the_figures_of_64(device: Device, tmp_path: Path) -> None:
-    told = {scheme: lut("ltc", tmp_path / f"{scheme}.npy", scheme=scheme, device=device).manifest
-            for scheme in SCHEMES}
+    told = {scheme: lut("ltc", tmp_path / f"{scheme}.npy", scheme=scheme, device=device).manifest for scheme in SCHEMES}
     assert told["free"]["shape"] == [64, 64, 8]
     assert told["free"]["misplaced"]["float32"]["mean"] <= 0.075  # .089 is asked, numerics' own L1 probe has .075
     assert told["heitz"]["misplaced"]["float32"]["mean"] <= 0.12
@@ -314,9 +314,16 @@ def test_it_is_the_same_every_time_and_in_two_textures(device: Device, tmp_path:
 
 
 @pytest.mark.few(2)
-@pytest.mark.parametrize("options", [{"ndf": "beckmann"}, {"ndf": "gtr:gamma=1.8", "masking": "smith_separable"},
-                                     {"ndf": "charlie", "axes": {"alpha": (0.2, 1, 4)}}, {"masking": "kelemen"}],
-                         ids=lambda o: "-".join(map(str, o.values())))
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"ndf": "beckmann"},
+        {"ndf": "gtr:gamma=1.8", "masking": "smith_separable"},
+        {"ndf": "charlie", "axes": {"alpha": (0.2, 1, 4)}},
+        {"masking": "kelemen"},
+    ],
+    ids=lambda o: "-".join(map(str, o.values())),
+)
 def test_other_models_find_their_lobes(device: Device, tmp_path: Path, options: dict[str, Any]) -> None:
     """m < .9 for each cell but those that Charlie's rim makes hollow; 2 would be nothing in common."""
     made = lut("ltc", tmp_path / "t.npy", size=6, device=device, **options)
@@ -335,16 +342,19 @@ def test_the_axes_of_engines(device: Device, tmp_path: Path) -> None:
     assert theta.axes[1].at(np.array([0.5]))[0] == pytest.approx(np.sqrt(0.5))
 
 
-@pytest.mark.parametrize("options, error, words", [
-    ({"scheme": "fre"}, UsageError, "unknown scheme 'fre'; did you mean 'free'"),
-    ({"ndf": "ggx_anisotropic"}, UnsupportedError, "isotropic"),
-    ({"fresnel": "schlick:f0=.5"}, UnsupportedError, "Fresnel's term is 1"),
-    ({"diffuse": "burley"}, UnsupportedError, "nothing else is added"),
-    ({"fit": "bilinear"}, UsageError, "a fit by itself"),
-    ({"as_read": True}, UsageError, "a fit by itself"),
-    ({"axes": {"NoV": (0, 2, 8, "angle")}}, UsageError, "from -1 to 1"),
-    ({"size": "0"}, UsageError, "size 0 is outside"),
-])
+@pytest.mark.parametrize(
+    "options, error, words",
+    [
+        ({"scheme": "fre"}, UsageError, "unknown scheme 'fre'; did you mean 'free'"),
+        ({"ndf": "ggx_anisotropic"}, UnsupportedError, "isotropic"),
+        ({"fresnel": "schlick:f0=.5"}, UnsupportedError, "Fresnel's term is 1"),
+        ({"diffuse": "burley"}, UnsupportedError, "nothing else is added"),
+        ({"fit": "bilinear"}, UsageError, "a fit by itself"),
+        ({"as_read": True}, UsageError, "a fit by itself"),
+        ({"axes": {"NoV": (0, 2, 8, "angle")}}, UsageError, "from -1 to 1"),
+        ({"size": "0"}, UsageError, "size 0 is outside"),
+    ],
+)
 def test_refusals(tmp_path: Path, options: dict[str, Any], error: type[Exception], words: str) -> None:
     with pytest.raises(error, match=words):
         tables.plan(tables.TableRequest("ltc", tmp_path / "t.npy", **options))

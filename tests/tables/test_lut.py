@@ -1,4 +1,5 @@
 """`whitefurnace lut` from the command line to the files: axes, values, manifest, ownership, refusals, stops."""
+
 from __future__ import annotations
 
 import hashlib
@@ -61,8 +62,10 @@ def test_dfg_is_the_table_of_the_design(tmp_path, shell):
     assert np.array_equal(table, want.values)
     m = manifest(path)
     assert m["error"] == want.error and m["rule"] == want.rule and m["evaluations"] == want.evaluations
-    assert m["axes"] == [{"name": "NoV", "from": 0, "to": 1, "count": 24, "scale": "centres"},
-                         {"name": "roughness", "from": 0, "to": 1, "count": 16, "scale": "centres"}]
+    assert m["axes"] == [
+        {"name": "NoV", "from": 0, "to": 1, "count": 24, "scale": "centres"},
+        {"name": "roughness", "from": 0, "to": 1, "count": 16, "scale": "centres"},
+    ]
     assert m["models"] == {"ndf": {"name": "ggx"}, "masking": {"name": "smith"}} and m["shape"] == [16, 24, 2]
     lut("dfg", tmp_path / "square.npy", size=8, tolerance=5e-6)
     assert np.array_equal(np.load(tmp_path / "square.npy"), dfg(8).values)
@@ -97,8 +100,9 @@ def test_exr_carries_its_recipe(tmp_path, shell):
     path = tmp_path / "gold.exr"
     assert shell("lut", "albedo", "-o", path, "--size", "8x4", "--fresnel", "schlick:gold") == 0, shell.err
     pixels, told = read_exr(path)
-    want = integrate("albedo", ndf="ggx", fresnel="schlick:gold", NoV=centres(8),
-                     alpha=alpha_of_roughness(centres(4))[:, None])
+    want = integrate(
+        "albedo", ndf="ggx", fresnel="schlick:gold", NoV=centres(8), alpha=alpha_of_roughness(centres(4))[:, None]
+    )
     assert np.array_equal(pixels, want.values) and told["channels"] == ["R", "G", "B"]
     assert told["whitefurnace:integral"] == "albedo" and told["whitefurnace:rule"] == want.rule
     assert told["whitefurnace:error"] == pytest.approx(want.error, rel=1e-6)  # float32 in EXR
@@ -119,8 +123,15 @@ def test_axes_and_fixed_parameters(tmp_path):
     assert np.array_equal(np.load(path), want.values)
     made = lut("albedo", path, size=3, fresnel="schlick", axes={"NoV": (0, 1, 4), "f0": (0, 1, 2)}, **one)
     assert [a.name for a in made.axes] == ["NoV", "roughness", "f0"] and made.shape == (2, 3, 4)
-    want = integrate("albedo", ndf="ggx", fresnel="schlick", NoV=np.linspace(0, 1, 4), alpha=centres(3)[:, None] ** 2,
-                     f0=np.array([0, 1])[:, None, None], tolerance=1e-3)
+    want = integrate(
+        "albedo",
+        ndf="ggx",
+        fresnel="schlick",
+        NoV=np.linspace(0, 1, 4),
+        alpha=centres(3)[:, None] ** 2,
+        f0=np.array([0, 1])[:, None, None],
+        tolerance=1e-3,
+    )
     assert np.array_equal(np.load(path), want.values)
     made = lut("albedo", path, size=3, alpha=0.3, **one)
     assert [a.name for a in made.axes] == ["NoV"] and made.shape == (1, 3)
@@ -132,8 +143,9 @@ def test_axes_and_fixed_parameters(tmp_path):
     made = lut("albedo", path, size=2, ndf="ggx_anisotropic", axes={"phi": (0, math.pi / 2, 3)}, **one)
     assert made.shape == (3, 2, 2)
     made = lut("albedo", path, size=2, ndf="ggx", masking="schlick_smith", **one)  # both follow roughness
-    want = integrate("albedo", ndf="ggx", masking="schlick_smith", NoV=centres(2), alpha=centres(2)[:, None] ** 2,
-                     tolerance=1e-3)
+    want = integrate(
+        "albedo", ndf="ggx", masking="schlick_smith", NoV=centres(2), alpha=centres(2)[:, None] ** 2, tolerance=1e-3
+    )
     assert np.array_equal(np.load(path), want.values)
     made = lut("albedo", path, size=2, ndf="gtr:gamma=1", **one)
     want = integrate("albedo", ndf="gtr", gamma=1, NoV=centres(2), alpha=centres(2)[:, None] ** 2, tolerance=1e-3)
@@ -169,8 +181,19 @@ def test_axis_forms():
     assert axis("a", "1:100:3:log").values() == pytest.approx([1, 10, 100], rel=1e-15)
     assert axis("a", "0:1:2:centres").values().tolist() == [0.25, 0.75]
     assert axis("a", "1:0:2").values().tolist() == [1, 0] and axis("a", "2:3:1").values().tolist() == [2]
-    for bad in ("0:1", "0:1:2:3:4", "a:1:2", "0:1:1.5", "0:1:3:lug", "0:1:3:log", "nan:1:3", "0:inf:3", "0:1:0",
-                "0:1:16385", ""):
+    for bad in (
+        "0:1",
+        "0:1:2:3:4",
+        "a:1:2",
+        "0:1:1.5",
+        "0:1:3:lug",
+        "0:1:3:log",
+        "nan:1:3",
+        "0:inf:3",
+        "0:1:0",
+        "0:1:16385",
+        "",
+    ):
         with pytest.raises(UsageError):
             axis("a", bad)
 
@@ -178,45 +201,49 @@ def test_axis_forms():
 # --- refusals ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("arguments, code, words", [
-    (("albdo", "-o", "t.npy"), 1, "albedo"),
-    (("albedo", "-o", "t.tga"), 1, ".dds or .h"),
-    (("albedo", "-o", "t"), 1, ".dds or .h"),
-    (("albedo",), 1, "--output"),
-    (("albedo", "-o", "t.npy", "--size", "0"), 1, "[1, 16384]"),
-    (("albedo", "-o", "t.npy", "--size", "16385"), 1, "[1, 16384]"),
-    (("albedo", "-o", "t.npy", "--size", "4x16385"), 1, "[1, 16384]"),
-    (("albedo", "-o", "t.npy", "--size", "4x"), 1, "NxM"),
-    (("normalization", "-o", "t.npy", "--size", "4x4"), 1, "NoV"),
-    (("albedo", "-o", "t.npy", "--size", "4x4", "--set", "alpha=.1"), 1, "roughness"),
-    (("albedo", "-o", "t.npy", "--ndf", "gxx"), 1, "ggx"),
-    (("albedo", "-o", "t.npy", "--diffuse", "oren_nayar"), 1, "needs albedo"),
-    (("albedo", "-o", "t.npy", "--fresnel", "schlick"), 1, "needs f0"),
-    (("albedo", "-o", "t.npy", "--diffuse", "lambert", "--masking", "smith"), 1, "masking"),
-    (("albedo", "-o", "t.npy", "--set", "alhpa=.1"), 1, "alpha"),
-    (("albedo", "-o", "t.npy", "--set", "alpha"), 1, "NAME=VALUE"),
-    (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--set", "alpha=.2"), 1, "once"),
-    (("albedo", "-o", "t.npy", "--set", "alpha=0:1:3"), 1, "axis"),
-    (("albedo", "-o", "t.npy", "--set", "alpha=2"), 1, "[1e-05, 1]"),
-    (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--axis", "alpha=.1:1:3"), 1, "both"),
-    (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--axis", "roughness=.1:1:3"), 1, "roughness"),
-    (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--set", "NoV=1"), 1, "axis"),
-    (("albedo", "-o", "t.npy", "--set", "precision=.1"), 1, "option"),
-    (("albedo", "-o", "t.npy", "--axis", "NoV=-1:1:3"), 1, "backfacing"),
-    (("albedo", "-o", "t.npy", "--light", "punctual"), 1, "radiance"),
-    (("radiance", "-o", "t.npy"), 1, "light or an environment"),
-    (("albedo", "-o", "t.exr", "--axis", "f0=0:1:2", "--fresnel", "schlick"), 1, "two axes"),
-    (("albedo", "-o", "t.exr", "--precision", "64"), 1, "float32"),
-    (("albedo", "-o", "t.npy", "--precision", "16"), 1, "32, 64"),
-    (("albedo", "-o", "t.npy", "--tolerance", "0"), 1, "(0, 1)"),
-    (("albedo", "-o", "t.npy", "--tolerance", "nan"), 1, "(0, 1)"),
-    (("albedo", "-o", "t.npy", "--device", "no such device"), 1, "no such device"),
-    (("dfg", "-o", "t.npy", "--diffuse", "lambert"), 5, "dfg"),
-    (("weak_furnace", "-o", "t.npy", "--masking", "neumann"), 5, "neumann has no G1"),
-    (("albedo", "-o", "nowhere/t.npy"), 2, "nowhere"),
-    (("albedo", "-o", "nowhere/t.exr"), 2, "nowhere"),
-    (("albedo", "-o", "t.npy", "--ndf", "none.clh"), 2, "none.clh"),
-], ids=lambda value: " ".join(value) if isinstance(value, tuple) else None)
+@pytest.mark.parametrize(
+    "arguments, code, words",
+    [
+        (("albdo", "-o", "t.npy"), 1, "albedo"),
+        (("albedo", "-o", "t.tga"), 1, ".dds or .h"),
+        (("albedo", "-o", "t"), 1, ".dds or .h"),
+        (("albedo",), 1, "--output"),
+        (("albedo", "-o", "t.npy", "--size", "0"), 1, "[1, 16384]"),
+        (("albedo", "-o", "t.npy", "--size", "16385"), 1, "[1, 16384]"),
+        (("albedo", "-o", "t.npy", "--size", "4x16385"), 1, "[1, 16384]"),
+        (("albedo", "-o", "t.npy", "--size", "4x"), 1, "NxM"),
+        (("normalization", "-o", "t.npy", "--size", "4x4"), 1, "NoV"),
+        (("albedo", "-o", "t.npy", "--size", "4x4", "--set", "alpha=.1"), 1, "roughness"),
+        (("albedo", "-o", "t.npy", "--ndf", "gxx"), 1, "ggx"),
+        (("albedo", "-o", "t.npy", "--diffuse", "oren_nayar"), 1, "needs albedo"),
+        (("albedo", "-o", "t.npy", "--fresnel", "schlick"), 1, "needs f0"),
+        (("albedo", "-o", "t.npy", "--diffuse", "lambert", "--masking", "smith"), 1, "masking"),
+        (("albedo", "-o", "t.npy", "--set", "alhpa=.1"), 1, "alpha"),
+        (("albedo", "-o", "t.npy", "--set", "alpha"), 1, "NAME=VALUE"),
+        (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--set", "alpha=.2"), 1, "once"),
+        (("albedo", "-o", "t.npy", "--set", "alpha=0:1:3"), 1, "axis"),
+        (("albedo", "-o", "t.npy", "--set", "alpha=2"), 1, "[1e-05, 1]"),
+        (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--axis", "alpha=.1:1:3"), 1, "both"),
+        (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--axis", "roughness=.1:1:3"), 1, "roughness"),
+        (("albedo", "-o", "t.npy", "--set", "alpha=.1", "--set", "NoV=1"), 1, "axis"),
+        (("albedo", "-o", "t.npy", "--set", "precision=.1"), 1, "option"),
+        (("albedo", "-o", "t.npy", "--axis", "NoV=-1:1:3"), 1, "backfacing"),
+        (("albedo", "-o", "t.npy", "--light", "punctual"), 1, "radiance"),
+        (("radiance", "-o", "t.npy"), 1, "light or an environment"),
+        (("albedo", "-o", "t.exr", "--axis", "f0=0:1:2", "--fresnel", "schlick"), 1, "two axes"),
+        (("albedo", "-o", "t.exr", "--precision", "64"), 1, "float32"),
+        (("albedo", "-o", "t.npy", "--precision", "16"), 1, "32, 64"),
+        (("albedo", "-o", "t.npy", "--tolerance", "0"), 1, "(0, 1)"),
+        (("albedo", "-o", "t.npy", "--tolerance", "nan"), 1, "(0, 1)"),
+        (("albedo", "-o", "t.npy", "--device", "no such device"), 1, "no such device"),
+        (("dfg", "-o", "t.npy", "--diffuse", "lambert"), 5, "dfg"),
+        (("weak_furnace", "-o", "t.npy", "--masking", "neumann"), 5, "neumann has no G1"),
+        (("albedo", "-o", "nowhere/t.npy"), 2, "nowhere"),
+        (("albedo", "-o", "nowhere/t.exr"), 2, "nowhere"),
+        (("albedo", "-o", "t.npy", "--ndf", "none.clh"), 2, "none.clh"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
+)
 def test_refusals_are_one_sentence_and_leave_nothing(tmp_path, shell, monkeypatch, arguments, code, words):
     monkeypatch.chdir(tmp_path)
     assert shell("lut", *arguments) == code, shell.err
@@ -238,9 +265,20 @@ def test_the_same_recipe_is_skipped_and_gives_the_same_bytes(tmp_path, shell, su
     assert shell(*make) == 0 and tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("more", [("--size", 9), ("--ndf", "beckmann"), ("--masking", "neumann"),
-                                  ("--tolerance", "1e-4"), ("--precision", "64"), ("--set", "alpha=.3"),
-                                  ("--axis", "NoV=.1:1:8"), ("--backfacing", "clamp")], ids=str)
+@pytest.mark.parametrize(
+    "more",
+    [
+        ("--size", 9),
+        ("--ndf", "beckmann"),
+        ("--masking", "neumann"),
+        ("--tolerance", "1e-4"),
+        ("--precision", "64"),
+        ("--set", "alpha=.3"),
+        ("--axis", "NoV=.1:1:8"),
+        ("--backfacing", "clamp"),
+    ],
+    ids=str,
+)
 def test_another_recipe_replaces_what_is_ours(tmp_path, shell, more):
     path = tmp_path / "t.npy"
     assert shell("lut", "dfg", "-o", path, "--size", 8) == 0
@@ -329,13 +367,15 @@ def test_a_read_only_disk(tmp_path, shell):
 def test_files_that_may_not_grow(tmp_path):
     """A limit on file size stands in for a full disk where nothing can be mounted."""
     pytest.importorskip("resource")
-    code = ("import resource, sys; from whitefurnace import lut, integrate\n"
-            "from whitefurnace.errors import FileError\n"
-            "lut('dfg', sys.argv[1], size=4)\n"
-            "soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE); resource.setrlimit(resource.RLIMIT_FSIZE, "
-            "(20_000, hard))\n"
-            "try:\n    lut('dfg', sys.argv[1], size=256)\n"
-            "except FileError as error:\n    print(error)\n")
+    code = (
+        "import resource, sys; from whitefurnace import lut, integrate\n"
+        "from whitefurnace.errors import FileError\n"
+        "lut('dfg', sys.argv[1], size=4)\n"
+        "soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE); resource.setrlimit(resource.RLIMIT_FSIZE, "
+        "(20_000, hard))\n"
+        "try:\n    lut('dfg', sys.argv[1], size=256)\n"
+        "except FileError as error:\n    print(error)\n"
+    )
     done = subprocess.run([sys.executable, "-c", code, tmp_path / "t.npy"], capture_output=True, text=True)
     assert done.returncode == 0 and str(tmp_path / "t.npy") in done.stdout, done.stderr
     assert np.load(tmp_path / "t.npy").shape == (4, 4, 2)
@@ -349,9 +389,13 @@ def test_ctrl_c_leaves_what_was_there(tmp_path, suffix):
     lut("dfg", path, size=8)
     before = tree(tmp_path)
     # A minute of work: the temporary file appears when it begins, for EXR a nameless one, so a while is waited.
-    run = subprocess.Popen(command("lut", "dfg", "-o", path, "--size", 6000), stdout=subprocess.PIPE,
-                           stderr=subprocess.PIPE, text=True,
-                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
+    run = subprocess.Popen(
+        command("lut", "dfg", "-o", path, "--size", 6000),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
     begin = time.monotonic()
     while suffix == ".npy" and not list(tmp_path.glob(".*")):
         assert run.poll() is None and time.monotonic() - begin < 60
@@ -368,10 +412,12 @@ def test_ctrl_c_leaves_what_was_there(tmp_path, suffix):
 def test_a_large_table_takes_little_memory(tmp_path):
     """4 million cells, 33 MB, in at most 16 MB more than a small table takes."""
     resource = pytest.importorskip("resource")
-    code = ("import resource, sys; from whitefurnace import lut\n"
-            "def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
-            "lut('dfg', sys.argv[1] + '/small.npy', size=512, tolerance=.1); small = peak()\n"
-            "lut('dfg', sys.argv[1] + '/large.npy', size=2048, tolerance=.1); print(peak() - small)\n")
+    code = (
+        "import resource, sys; from whitefurnace import lut\n"
+        "def peak(): return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss\n"
+        "lut('dfg', sys.argv[1] + '/small.npy', size=512, tolerance=.1); small = peak()\n"
+        "lut('dfg', sys.argv[1] + '/large.npy', size=2048, tolerance=.1); print(peak() - small)\n"
+    )
     done = subprocess.run([sys.executable, "-c", code, tmp_path], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     kilobytes = 1 if sys.platform == "darwin" else 1024

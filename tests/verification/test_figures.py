@@ -1,4 +1,5 @@
 """Figures: there for a model of every slot and for a user's, the same bytes twice, a clear word without the extra."""
+
 from __future__ import annotations
 
 import sys
@@ -50,9 +51,18 @@ def colours(path: Path) -> int:
 
 
 @pytest.mark.few(3)
-@pytest.mark.parametrize("slot, name", [("ndf", "gtr"), ("ndf", "beckmann_anisotropic"),
-                                        ("masking", "schlick_smith"), ("fresnel", "schlick"), ("fresnel", "dielectric"),
-                                        ("fresnel", "one"), ("diffuse", "minnaert")])
+@pytest.mark.parametrize(
+    "slot, name",
+    [
+        ("ndf", "gtr"),
+        ("ndf", "beckmann_anisotropic"),
+        ("masking", "schlick_smith"),
+        ("fresnel", "schlick"),
+        ("fresnel", "dielectric"),
+        ("fresnel", "one"),
+        ("diffuse", "minnaert"),
+    ],
+)
 def test_a_figure_a_model(device: Device, tmp_path: Path, slot: str, name: str) -> None:
     entry = model(slot, name)
     path = tmp_path / "figures" / f"{slot}_{name}.png"
@@ -61,14 +71,19 @@ def test_a_figure_a_model(device: Device, tmp_path: Path, slot: str, name: str) 
     assert colours(tmp_path / f"figures/{slot}_{name}.png") > 20
 
 
-@pytest.mark.parametrize("slot, name, text, parameters", [
-    pytest.param("ndf", "lobe", LOBE, {"spread": 0.3}, id="lobe", marks=pytest.mark.long),
-    pytest.param("ndf", "lobe", LOBE, {}, id="lobe-guessed", marks=pytest.mark.long),
-    pytest.param("ndf", "bare", BARE, {}, id="bare"),
-    pytest.param("ndf", "steep", STEEP, {}, id="steep", marks=pytest.mark.long),
-    pytest.param("brdf", "paint", PAINT, {"gloss": 0.4}, id="brdf")])
-def test_a_users_model(device: Device, tmp_path: Path, slot: str, name: str, text: str,
-                       parameters: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "slot, name, text, parameters",
+    [
+        pytest.param("ndf", "lobe", LOBE, {"spread": 0.3}, id="lobe", marks=pytest.mark.long),
+        pytest.param("ndf", "lobe", LOBE, {}, id="lobe-guessed", marks=pytest.mark.long),
+        pytest.param("ndf", "bare", BARE, {}, id="bare"),
+        pytest.param("ndf", "steep", STEEP, {}, id="steep", marks=pytest.mark.long),
+        pytest.param("brdf", "paint", PAINT, {"gloss": 0.4}, id="brdf"),
+    ],
+)
+def test_a_users_model(
+    device: Device, tmp_path: Path, slot: str, name: str, text: str, parameters: dict[str, float]
+) -> None:
     """With the parameters of its rows, or with guesses; a panel that a model has no values for says why."""
     entry = user(tmp_path, slot, name, text)
     written = figures.draw(tmp_path, [entry], [row(entry, **parameters)] if parameters else [], device)
@@ -95,13 +110,13 @@ def test_the_same_bytes_twice_and_a_verdict(device: Device, tmp_path: Path, monk
     import matplotlib
 
     entry = model("diffuse", "burley")
-    first, = figures.draw(tmp_path / "a", [entry], [row(entry)], device)
+    (first,) = figures.draw(tmp_path / "a", [entry], [row(entry)], device)
     monkeypatch.setitem(matplotlib.rcParams, "lines.linewidth", 9)  # somebody's matplotlibrc
-    second, = figures.draw(tmp_path / "b", [entry], [row(entry)], device)
+    (second,) = figures.draw(tmp_path / "b", [entry], [row(entry)], device)
     assert first.read_bytes() == second.read_bytes()
     assert matplotlib.rcParams["lines.linewidth"] == 9
     assert b"tEXt" not in first.read_bytes() and b"tIME" not in first.read_bytes()
-    failed, = figures.draw(tmp_path / "c", [entry], [row(entry, passed=False)], device)
+    (failed,) = figures.draw(tmp_path / "c", [entry], [row(entry, passed=False)], device)
     assert failed.read_bytes() != first.read_bytes()
 
 

@@ -1,4 +1,5 @@
 """`verify`: every entry has rows that pass, and what is broken on purpose fails the check that is meant to find it."""
+
 from __future__ import annotations
 
 import dataclasses
@@ -23,22 +24,22 @@ from whitefurnace.verification.checks import Row, Subject, subjects, verify
 FILES = {
     # GGX but for a factor: any scale is fine.
     "lobe": "real ndf_lobe_D(real cos_m, real alpha) {\n  real t = cos_m * cos_m * (alpha * alpha - 1) + 1;\n"
-            "  return 7 / (t * t);\n}\n",
+    "  return 7 / (t * t);\n}\n",
     "steep": "real ndf_steep_D(real cos_m) { return 1 / (cos_m * cos_m); }\n",
     "dips": "real ndf_dips_D(real cos_m) { return cos_m - (real)0.5f; }\n",
     "tail": "real ndf_tail_D(real cos_m) { return 1 / cos_m; }\n",
     "white": "real3 brdf_white_f(real3 l, real3 v, real albedo) {\n  real f = albedo / PI;\n"
-             "  return vec3(f, f / 2, f / 3);\n}\n",
+    "  return vec3(f, f / 2, f / 3);\n}\n",
     "oneway": "real3 brdf_oneway_f(real3 l, real3 v) { real f = l.z / PI; return vec3(f, f, f); }\n",
     "gains": "real3 brdf_gains_f(real3 l, real3 v) {\n  real f = (real)(scalar)0.4f;\n"
-             "  return vec3(f / 2, f, f / 2);\n}\n",
+    "  return vec3(f / 2, f, f / 2);\n}\n",
     "hole": "real3 brdf_hole_f(real3 l, real3 v) {\n  real f = sqrt(l.z + v.z - (real)0.1f) / PI;\n"
-            "  return vec3(f, f, f);\n}\n",
+    "  return vec3(f, f, f);\n}\n",
     "minus": "real3 brdf_minus_f(real3 l, real3 v) {\n  real f = (dot3(l, v) - (real)0.5f) / 10;\n"
-             "  return vec3(f, f, f);\n}\n",
+    "  return vec3(f, f, f);\n}\n",
     # NaN between the angles at which a D is looked at first.
     "gap": "real ndf_gap_D(real cos_m, real sin2_m) {\n"
-           "  return sqrt((sin2_m - (real)0.251f) * (sin2_m - (real)0.25f));\n}\n",
+    "  return sqrt((sin2_m - (real)0.251f) * (sin2_m - (real)0.25f));\n}\n",
     "top": "real ndf_top_D(real cos_m) { return (1 - cos_m) / (1 - cos_m); }\n",
     "neither": "real3 something_f(real3 l, real3 v) { return l; }\n",
 }
@@ -177,31 +178,56 @@ def test_a_wrong_area_breaks_the_furnace(device: Device, monkeypatch: pytest.Mon
 
 def test_a_wrong_sampler(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     right = verification.sample
-    monkeypatch.setattr(verification, "sample",
-                        lambda ndf, count, alpha, **rest: right(ndf, count, alpha=min(1.03 * alpha, 1.0), **rest))
+    monkeypatch.setattr(
+        verification,
+        "sample",
+        lambda ndf, count, alpha, **rest: right(ndf, count, alpha=min(1.03 * alpha, 1.0), **rest),
+    )
     bad = failed(rows_of(model("ndf", "ggx"), device))
     assert set(bad) == {"sampler, chi²"} and bad["sampler, chi²"].counterexample is not None
 
 
-@pytest.mark.parametrize("slot, name, text, checks", [
-    ("fresnel", "schlick", "static inline real fresnel_schlick_F(real cos_d FRESNEL_PARAMETERS) {\n"
-     "  const real m = 1 - cos_d;\n  return fresnel_f0 + (fresnel_f90 - fresnel_f0) * m * m * m * m;\n}\n",
-     {"kernel F"}),
-    ("fresnel", "one", "static inline real fresnel_one_F(real cos_d FRESNEL_PARAMETERS) { return 1 + cos_d / 8; }\n",
-     {"kernel F", "F at most 1", "F at 0°"}),
-    ("masking", "implicit",
-     "static inline real masking_implicit_at(DIRECTION d MASKING_PARAMETERS) { return (real)0; }\n"
-     "static inline real masking_implicit_V(real NoV, real NoL, real NoH, real VoH, real at_v, real at_l\n"
-     "    MASKING_PARAMETERS) { return (real)1 + NoL / 4; }\n"
-     "static inline real masking_implicit_G(real NoV, real NoL, real NoH, real VoH, real at_v, real at_l\n"
-     "    MASKING_PARAMETERS) { return NoV * NoL; }\n",
-     {"kernel V", "G = V (n·l)(n·v)", "reciprocity", "G of a backfacing light"}),
-    ("diffuse", "lambert", "static inline real diffuse_lambert_f(real3 l, real3 v, real albedo) {\n"
-     "  return albedo / PI * ((real)1.1f - l.z * (real)0.25f);\n}\n",
-     {"kernel f", "reciprocity", "albedo"}),
-    ("diffuse", "lambert", "static inline real diffuse_lambert_f(real3 l, real3 v, real albedo) {\n"
-     "  return albedo / 3;\n}\n", {"kernel f", "albedo", "energy: albedo", "energy: albedo as declared"}),
-])
+@pytest.mark.parametrize(
+    "slot, name, text, checks",
+    [
+        (
+            "fresnel",
+            "schlick",
+            "static inline real fresnel_schlick_F(real cos_d FRESNEL_PARAMETERS) {\n"
+            "  const real m = 1 - cos_d;\n  return fresnel_f0 + (fresnel_f90 - fresnel_f0) * m * m * m * m;\n}\n",
+            {"kernel F"},
+        ),
+        (
+            "fresnel",
+            "one",
+            "static inline real fresnel_one_F(real cos_d FRESNEL_PARAMETERS) { return 1 + cos_d / 8; }\n",
+            {"kernel F", "F at most 1", "F at 0°"},
+        ),
+        (
+            "masking",
+            "implicit",
+            "static inline real masking_implicit_at(DIRECTION d MASKING_PARAMETERS) { return (real)0; }\n"
+            "static inline real masking_implicit_V(real NoV, real NoL, real NoH, real VoH, real at_v, real at_l\n"
+            "    MASKING_PARAMETERS) { return (real)1 + NoL / 4; }\n"
+            "static inline real masking_implicit_G(real NoV, real NoL, real NoH, real VoH, real at_v, real at_l\n"
+            "    MASKING_PARAMETERS) { return NoV * NoL; }\n",
+            {"kernel V", "G = V (n·l)(n·v)", "reciprocity", "G of a backfacing light"},
+        ),
+        (
+            "diffuse",
+            "lambert",
+            "static inline real diffuse_lambert_f(real3 l, real3 v, real albedo) {\n"
+            "  return albedo / PI * ((real)1.1f - l.z * (real)0.25f);\n}\n",
+            {"kernel f", "reciprocity", "albedo"},
+        ),
+        (
+            "diffuse",
+            "lambert",
+            "static inline real diffuse_lambert_f(real3 l, real3 v, real albedo) {\n  return albedo / 3;\n}\n",
+            {"kernel f", "albedo", "energy: albedo", "energy: albedo as declared"},
+        ),
+    ],
+)
 def test_a_broken_kernel(device: Device, slot: str, name: str, text: str, checks: set[str]) -> None:
     bad = failed(rows_of(dataclasses.replace(model(slot, name), text=text), device))
     assert checks <= set(bad), sorted(bad)
@@ -214,8 +240,10 @@ def test_a_broken_kernel(device: Device, slot: str, name: str, text: str, checks
         assert all(abs(np.linalg.norm(where[d]) - 1) < 1e-6 and where[d][2] >= 0 for d in "lv")
 
 
-@pytest.mark.parametrize("stated, check", [({"reciprocal": False}, "not reciprocal, as declared"),
-                                          ({"largest_albedo": 0.9}, "energy: albedo as declared")])
+@pytest.mark.parametrize(
+    "stated, check",
+    [({"reciprocal": False}, "not reciprocal, as declared"), ({"largest_albedo": 0.9}, "energy: albedo as declared")],
+)
 def test_a_false_declaration(device: Device, stated: dict[str, Any], check: str) -> None:
     lambert = model("diffuse", "lambert")
     bad = failed(rows_of(dataclasses.replace(lambert, checks=dataclasses.replace(lambert.checks, **stated)), device))
@@ -244,8 +272,10 @@ def test_a_brdf_from_a_file(device: Device, files: Path) -> None:
     assert {row.parameters["albedo"] for row in colours} == {0.9, 0.5, 0.1}
 
 
-@pytest.mark.parametrize("stem, check", [("oneway", "reciprocity"), ("gains", "energy: albedo"), ("hole", "f finite"),
-                                         ("minus", "f at least 0")])
+@pytest.mark.parametrize(
+    "stem, check",
+    [("oneway", "reciprocity"), ("gains", "energy: albedo"), ("hole", "f finite"), ("minus", "f at least 0")],
+)
 def test_a_broken_brdf(device: Device, files: Path, stem: str, check: str) -> None:
     bad = failed(list(verify(subjects([f"{files}/{stem}.clh"]), [32], device)))
     assert set(bad) == {check}
@@ -254,14 +284,23 @@ def test_a_broken_brdf(device: Device, files: Path, stem: str, check: str) -> No
     light, v = np.array(where["l"]), np.array(where["v"])
     assert np.isclose([light @ light, v @ v], 1, atol=1e-6).all() and light[2] > 0 and v[2] > 0
     # The counterexample is one.
-    assert {"oneway": abs(light[2] - v[2]) > 1e-3, "gains": abs(bad[check].value - 0.4 * math.pi) < 1e-5,
-            "hole": light[2] + v[2] < 0.1, "minus": light @ v < 0.5}[stem]
+    assert {
+        "oneway": abs(light[2] - v[2]) > 1e-3,
+        "gains": abs(bad[check].value - 0.4 * math.pi) < 1e-5,
+        "hole": light[2] + v[2] < 0.1,
+        "minus": light @ v < 0.5,
+    }[stem]
 
 
-@pytest.mark.parametrize("stem, kind, words", [("steep", InputError, "cannot be normalized"),
-                                               ("dips", InputError, "negative"),
-                                               ("top", InputError, "not finite at θ = 0 rad"),
-                                               ("tail", UnsupportedError, "masking: its projected area is infinite")])
+@pytest.mark.parametrize(
+    "stem, kind, words",
+    [
+        ("steep", InputError, "cannot be normalized"),
+        ("dips", InputError, "negative"),
+        ("top", InputError, "not finite at θ = 0 rad"),
+        ("tail", UnsupportedError, "masking: its projected area is infinite"),
+    ],
+)
 def test_an_ndf_that_is_refused(device: Device, files: Path, stem: str, kind: type[Exception], words: str) -> None:
     with pytest.raises(kind, match=words):
         list(verify(subjects([f"{files}/{stem}.clh"]), [32], device))
@@ -334,16 +373,25 @@ def test_the_table(capsys: pytest.CaptureFixture[str], files: Path) -> None:
     assert run(capsys, "one", "--precision", "32", "--quiet") == (0, "", "")
 
 
-@pytest.mark.parametrize("argv, code, words", [
-    (["gxx"], 1, "did you mean 'ggx'"),
-    (["one", "--precision", "16"], 1, "32, 64"),
-    (["one", "--device", "no such device"], 1, "no such device"),
-    (["none.clh"], 2, "none.clh"),
-    (["steep.clh"], 3, "cannot be normalized"),
-    (["tail.clh", "--precision", "32"], 5, "infinite"),
-])
-def test_exit_codes(capsys: pytest.CaptureFixture[str], files: Path, monkeypatch: pytest.MonkeyPatch, argv: list[str],
-                    code: int, words: str) -> None:
+@pytest.mark.parametrize(
+    "argv, code, words",
+    [
+        (["gxx"], 1, "did you mean 'ggx'"),
+        (["one", "--precision", "16"], 1, "32, 64"),
+        (["one", "--device", "no such device"], 1, "no such device"),
+        (["none.clh"], 2, "none.clh"),
+        (["steep.clh"], 3, "cannot be normalized"),
+        (["tail.clh", "--precision", "32"], 5, "infinite"),
+    ],
+)
+def test_exit_codes(
+    capsys: pytest.CaptureFixture[str],
+    files: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    argv: list[str],
+    code: int,
+    words: str,
+) -> None:
     monkeypatch.chdir(files)
     got, _, err = run(capsys, *argv)
     assert got == code and words in err and len(err.splitlines()) == 1

@@ -1,5 +1,6 @@
 """The error budget of a scene in an environment: the error of each approximation, and the cheapest bake within a
 tolerance."""
+
 from __future__ import annotations
 
 import os
@@ -32,8 +33,14 @@ def measure(scene: Scene, env: Environment, engine: Engine, recipe: Chain | None
     return ErrorMeter(scene, env, engine, device).budget(recipe or usual(engine))
 
 
-def of_image(scene: Scene, source: str, engine: Engine, tolerance: float | None = None,
-             device: str | None = None, without: Sequence[str] = ()) -> tuple[Budget, Choice | None]:
+def of_image(
+    scene: Scene,
+    source: str,
+    engine: Engine,
+    tolerance: float | None = None,
+    device: str | None = None,
+    without: Sequence[str] = (),
+) -> tuple[Budget, Choice | None]:
     """The error budget of an engine's usual bake of an image, and the cheapest set of files within a tolerance.
 
     source: a path, or "demo" for the built-in environment. tolerance: RMS, None for no choice. without: parts of the
@@ -45,5 +52,16 @@ def of_image(scene: Scene, source: str, engine: Engine, tolerance: float | None 
     return meter.budget(recipe), None if tolerance is None else choose(meter, tolerance, recipe)
 
 
-__all__ = ["TOLERANCE_RANGE", "Budget", "Choice", "Entry", "ErrorMeter", "ScenePoints", "choose", "measure", "of_image",
-           "sample_points", "usual"]
+__all__ = [
+    "TOLERANCE_RANGE",
+    "Budget",
+    "Choice",
+    "Entry",
+    "ErrorMeter",
+    "ScenePoints",
+    "choose",
+    "measure",
+    "of_image",
+    "sample_points",
+    "usual",
+]

@@ -1,4 +1,5 @@
 """Chooses the cheapest set of files whose error stays within a tolerance."""
+
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -111,11 +112,25 @@ def choose(meter: ErrorMeter, tolerance: float, recipe: Chain) -> Choice:
     best, made = found
     engine = best.candidate.engine
     entries = [e for e in meter.files(made, engine) if e.name not in but]
-    beyond = [meter.floor] * (meter.floor.rms > tolerance) + fixed + [
-        e for e in (*meter.split, *meter.model) if e.rms > tolerance]
-    return Choice(tolerance, _options(meter, engine, made, recipe), engine, made, best.candidate.nbytes,
-                  _nbytes(meter.preset, recipe), best.files + entries[0].rms, best.whole,
-                  max(entries, key=lambda e: e.rms), met, tuple(beyond), len(seen))
+    beyond = (
+        [meter.floor] * (meter.floor.rms > tolerance)
+        + fixed
+        + [e for e in (*meter.split, *meter.model) if e.rms > tolerance]
+    )
+    return Choice(
+        tolerance,
+        _options(meter, engine, made, recipe),
+        engine,
+        made,
+        best.candidate.nbytes,
+        _nbytes(meter.preset, recipe),
+        best.files + entries[0].rms,
+        best.whole,
+        max(entries, key=lambda e: e.rms),
+        met,
+        tuple(beyond),
+        len(seen),
+    )
 
 
 # ------------------------------------------------------------------------------------------------- measuring sets
@@ -124,14 +139,21 @@ def choose(meter: ErrorMeter, tolerance: float, recipe: Chain) -> Choice:
 def _fixed(meter: ErrorMeter, engines: Sequence[Engine], tolerance: float, recipe: Chain) -> list[Entry]:
     """The parts of the usual files that are over the tolerance and alike in every set."""
     storages = [Storage.of(engine) for engine in engines]
-    return [e for e in meter.files(recipe, meter.engine) if e.rms > tolerance and (
-        (e.name == "table" and storages[0].table is None) or
-        (e.name == "format" and len({s.chain for s in storages}) == 1) or
-        (e.name == "diffuse" and {s.diffuse[0] for s in storages} == {"sh"}))]
+    return [
+        e
+        for e in meter.files(recipe, meter.engine)
+        if e.rms > tolerance
+        and (
+            (e.name == "table" and storages[0].table is None)
+            or (e.name == "format" and len({s.chain for s in storages}) == 1)
+            or (e.name == "diffuse" and {s.diffuse[0] for s in storages} == {"sh"})
+        )
+    ]
 
 
-def _measured(meter: ErrorMeter, candidate: _Candidate, but: Sequence[str], tolerance: float,
-              reachable: bool) -> _Measured:
+def _measured(
+    meter: ErrorMeter, candidate: _Candidate, but: Sequence[str], tolerance: float, reachable: bool
+) -> _Measured:
     """Measure a candidate. but: parts that are not judged. reachable: judge the whole picture too."""
     engine, recipe = candidate.engine, candidate.recipe
     files = meter.entry("files", "files", meter.reads.picture(recipe, engine, but) - meter.reads.perfect, "").rms
@@ -179,9 +201,17 @@ def _engines(meter: ErrorMeter) -> list[Engine]:
     if engine.holding("dfg") and engine.dfg.NoV == "centres":
         found = [reduced(engine, (), size) for size in sorted({*TABLES, engine.dfg.size})]
     if engine.name not in ENGINES:
-        found = [msgspec.structs.replace(one, file=tuple(
-            msgspec.structs.replace(file, format=form) if file.holds == "specular" else file for file in one.file))
-            for one in found for form in writable_formats(engine.holding("specular")[0])]
+        found = [
+            msgspec.structs.replace(
+                one,
+                file=tuple(
+                    msgspec.structs.replace(file, format=form) if file.holds == "specular" else file
+                    for file in one.file
+                ),
+            )
+            for one in found
+            for form in writable_formats(engine.holding("specular")[0])
+        ]
     return found
 
 
@@ -192,16 +222,25 @@ def _chains(meter: ErrorMeter, recipe: Chain) -> list[Chain]:
     for size in sorted({*SIZES, recipe.size}):
         for fit in (None,) if engine.lods.follow else (None, "read"):  # levels that follow the lod go beyond r = 1
             # The certificates would cost more than the levels, so these chains have none.
-            base: dict[str, Any] = {"lods": engine.lods, "size": size, "fit": fit, "ndf": recipe.ndf.model,
-                                    "tolerance": FILTERS[-1], "certify": 0}
+            base: dict[str, Any] = {
+                "lods": engine.lods,
+                "size": size,
+                "fit": fit,
+                "ndf": recipe.ndf.model,
+                "tolerance": FILTERS[-1],
+                "certify": 0,
+            }
             if engine.whole:
                 found.append(chain(**base, usual_min=engine.min_size))
             elif engine.levels:
                 if size >> (engine.levels - 1):
                     found.append(chain(**base, levels=engine.levels))
             else:
-                found += [chain(**base, min_size=last) for last in sorted({
-                    max(recipe.min_size // 2, 1), recipe.min_size, 2 * recipe.min_size}) if last < size]
+                found += [
+                    chain(**base, min_size=last)
+                    for last in sorted({max(recipe.min_size // 2, 1), recipe.min_size, 2 * recipe.min_size})
+                    if last < size
+                ]
     return found
 
 

@@ -10,6 +10,7 @@ multiple scattering. Each approximation is measured alone:
 
 All errors are relative to the same reference, so they can be compared. They do not add up, because parts may cancel.
 """
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -35,8 +36,11 @@ from whitefurnace.sphere.environments import Environment
 
 Kind = Literal["files", "split", "model", "other"]
 
-_DIFFUSE = {"sh": "nine harmonics, windowed", "cube": "a cube of 32², read bilinearly",
-            "level": "the level of r = 1, whose lobe is the cosine's for GGX"}
+_DIFFUSE = {
+    "sh": "nine harmonics, windowed",
+    "cube": "a cube of 32², read bilinearly",
+    "level": "the level of r = 1, whose lobe is the cosine's for GGX",
+}
 
 
 @dataclass(frozen=True)
@@ -100,8 +104,17 @@ class ErrorMeter:
     Raises UnsupportedError for an engine that gets no prefiltered chain, and the errors of `sample_points`.
     """
 
-    def __init__(self, scene: Scene, env: Environment, engine: Engine, device: Device, *,
-                 without: Sequence[str] = (), count: int = POINTS, seed: int = 0) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        env: Environment,
+        engine: Engine,
+        device: Device,
+        *,
+        without: Sequence[str] = (),
+        count: int = POINTS,
+        seed: int = 0,
+    ) -> None:
         if not engine.needs("specular"):
             raise UnsupportedError(f"{engine.name} filters the image itself: what it shows is not ours to measure")
         self.scene, self.env, self.device = scene, env, device
@@ -117,8 +130,9 @@ class ErrorMeter:
         """(m, 3) reference radiance that errors are measured against."""
         return self.integrals.right
 
-    def entry(self, name: str, kind: Kind, difference: np.ndarray, what: str, *, used: bool = True,
-              bound: bool = False) -> Entry:
+    def entry(
+        self, name: str, kind: Kind, difference: np.ndarray, what: str, *, used: bool = True, bound: bool = False
+    ) -> Entry:
         """The entry of an approximation that changes the radiance of the points by `difference` (m, 3)."""
         off = texel_errors(self.right + difference, self.right, float(self.right.mean()))
         return Entry(name, kind, float(np.sqrt((off * off).mean())), float(np.quantile(off, 0.95)), what, used, bound)
@@ -131,17 +145,25 @@ class ErrorMeter:
         """
         engine = _upright(engine) if engine else self.engine
         files, X0, whole = self.files(recipe, engine), self.reads.perfect, self.reads.picture(recipe, engine)
-        return Budget(engine.name, self.env.name, recipe.levels, len(X0),
-                      (*files, *self.split, *self.model, *self._diffuse_otherwise(recipe, engine), *self._others),
-                      self.entry("files", "files", whole - X0, "all of them, against exact ones"), self.floor,
-                      self.entry("whole", "other", whole - self.right, "the engine's picture against the integral"),
-                      self.integrals.accuracy, self.sampled.notices)
+        return Budget(
+            engine.name,
+            self.env.name,
+            recipe.levels,
+            len(X0),
+            (*files, *self.split, *self.model, *self._diffuse_otherwise(recipe, engine), *self._others),
+            self.entry("files", "files", whole - X0, "all of them, against exact ones"),
+            self.floor,
+            self.entry("whole", "other", whole - self.right, "the engine's picture against the integral"),
+            self.integrals.accuracy,
+            self.sampled.notices,
+        )
 
     @cached_property
     def floor(self) -> Entry:
         """The error of the picture from exact files."""
-        return self.entry("exact files", "split", self.reads.perfect - self.right,
-                          "the engine with these, against the integral")
+        return self.entry(
+            "exact files", "split", self.reads.perfect - self.right, "the engine with these, against the integral"
+        )
 
     @cached_property
     def filter_share(self) -> float:
@@ -158,26 +180,51 @@ class ErrorMeter:
         specular, _ = reads.weights(AB)
         exact, read = reads.between(recipe), reads.read(recipe, "float32")
         found = [
-            self.entry("filter", "files", specular * P * reads.stated(recipe)[:, None],
-                       "p99 of texels that its levels state", bound=True),
-            self.entry("texels", "files", reads.shown(P + read - exact, D, AB) - X0,
-                       f"bilinear reads within levels of {recipe.size}² to {recipe.levels[-1][0]}²"),
-            self.entry("roughness", "files", reads.shown(exact, D, AB) - X0,
-                       f"linear reads between {len(recipe.levels)} levels" + (", fitted" if recipe.fit else "")),
-            self.entry("format", "files", reads.shown(P + reads.read(recipe, storage.chain) - read, D, AB) - X0,
-                       storage.chain)]
+            self.entry(
+                "filter",
+                "files",
+                specular * P * reads.stated(recipe)[:, None],
+                "p99 of texels that its levels state",
+                bound=True,
+            ),
+            self.entry(
+                "texels",
+                "files",
+                reads.shown(P + read - exact, D, AB) - X0,
+                f"bilinear reads within levels of {recipe.size}² to {recipe.levels[-1][0]}²",
+            ),
+            self.entry(
+                "roughness",
+                "files",
+                reads.shown(exact, D, AB) - X0,
+                f"linear reads between {len(recipe.levels)} levels" + (", fitted" if recipe.fit else ""),
+            ),
+            self.entry(
+                "format", "files", reads.shown(P + reads.read(recipe, storage.chain) - read, D, AB) - X0, storage.chain
+            ),
+        ]
         if storage.table is None:
-            found.append(self.entry("table", "files", reads.shown(P, D, reads.table(None, None)) - X0,
-                                    "Karis's fit in place of one"))
+            found.append(
+                self.entry(
+                    "table", "files", reads.shown(P, D, reads.table(None, None)) - X0, "Karis's fit in place of one"
+                )
+            )
         else:
             plain = reads.table(engine.dfg, None)
-            found.append(self.entry("table", "files", reads.shown(P, D, plain) - X0,
-                                    f"{engine.dfg.size}², read bilinearly"))
+            found.append(
+                self.entry("table", "files", reads.shown(P, D, plain) - X0, f"{engine.dfg.size}², read bilinearly")
+            )
             rounded = reads.table(engine.dfg, storage.table)
             changed = (AB[0] + rounded[0] - plain[0], AB[1] + rounded[1] - plain[1])
             found.append(self.entry("table format", "files", reads.shown(P, D, changed) - X0, storage.table))
-        found.append(self.entry("diffuse", "files", reads.shown(P, reads.diffuse_read(recipe, *storage.diffuse), AB)
-                                - X0, _DIFFUSE[storage.diffuse[0]]))
+        found.append(
+            self.entry(
+                "diffuse",
+                "files",
+                reads.shown(P, reads.diffuse_read(recipe, *storage.diffuse), AB) - X0,
+                _DIFFUSE[storage.diffuse[0]],
+            )
+        )
         return found
 
     @cached_property
@@ -188,13 +235,23 @@ class ErrorMeter:
         read = reads.prefiltered + (integrals.diffuse - reads.prefiltered) * reads.blend
         how = f"mix(mirror direction, n, {engine.bend})" if engine.bend != "0" else "the mirror direction"
         return (
-            self.entry("n = v = r", "split", specular * (read - integrals.own_view),
-                       f"a lobe seen from n, read in {how}" +
-                       (f", blended with E/π by {engine.blend}" if engine.blend != "0" else "")),
-            self.entry("F·G from L", "split", specular * (integrals.own_view - integrals.seen),
-                       "Fresnel and masking weigh no light"),
-            self.entry("split sum", "split", specular * (read - integrals.seen),
-                       "both of these, against the full integral"))
+            self.entry(
+                "n = v = r",
+                "split",
+                specular * (read - integrals.own_view),
+                f"a lobe seen from n, read in {how}"
+                + (f", blended with E/π by {engine.blend}" if engine.blend != "0" else ""),
+            ),
+            self.entry(
+                "F·G from L",
+                "split",
+                specular * (integrals.own_view - integrals.seen),
+                "Fresnel and masking weigh no light",
+            ),
+            self.entry(
+                "split sum", "split", specular * (read - integrals.seen), "both of these, against the full integral"
+            ),
+        )
 
     @cached_property
     def model(self) -> tuple[Entry, ...]:
@@ -202,18 +259,34 @@ class ErrorMeter:
         specular, rest = self.reads.weights(self.integrals.exact_table)
         schlick = self.integrals.reference(exact=False)
         return (
-            self.entry("energy", "model", specular * self.integrals.seen + rest * self.integrals.diffuse - schlick,
-                       "what it gives back of multiple scattering, and leaves for the diffuse"),
-            self.entry("Fresnel", "model", schlick - self.right, "Schlick's term for the materials' indices"))
+            self.entry(
+                "energy",
+                "model",
+                specular * self.integrals.seen + rest * self.integrals.diffuse - schlick,
+                "what it gives back of multiple scattering, and leaves for the diffuse",
+            ),
+            self.entry("Fresnel", "model", schlick - self.right, "Schlick's term for the materials' indices"),
+        )
 
     # ------------------------------------------------------------------------------------------- other choices
 
     def _diffuse_otherwise(self, recipe: Chain, engine: Engine) -> list[Entry]:
         """Errors of diffuse light that is stored in other ways than the engine's."""
         own = Storage.of(engine).diffuse[0]
-        return [self.entry(f"diffuse by {'harmonics' if how == 'sh' else 'cube'}", "other", self.reads.shown(
-            self.reads.prefiltered, self.reads.diffuse_read(recipe, how, "float32"), self.integrals.exact_table)
-            - self.reads.perfect, _DIFFUSE[how], used=False) for how in ("sh", "cube") if how != own]
+        return [
+            self.entry(
+                f"diffuse by {'harmonics' if how == 'sh' else 'cube'}",
+                "other",
+                self.reads.shown(
+                    self.reads.prefiltered, self.reads.diffuse_read(recipe, how, "float32"), self.integrals.exact_table
+                )
+                - self.reads.perfect,
+                _DIFFUSE[how],
+                used=False,
+            )
+            for how in ("sh", "cube")
+            if how != own
+        ]
 
     @cached_property
     def _others(self) -> tuple[Entry, ...]:
@@ -222,21 +295,53 @@ class ErrorMeter:
         found = []
         if self.engine.bend != "0" or self.engine.blend != "0":
             plain = integrals.each(
-                lambda g: integrals.lobe(single(g.roughness), mirrored(self.points.some(g.index)), g.count))
-            found.append(self.entry("mirror direction", "other",
-                                    self.reads.weights(integrals.exact_table)[0] * (plain - integrals.own_view),
-                                    "n = v = r read there, and nothing blended", used=False))
-        found.append(self.entry("single scattering", "other", integrals.reference(again=False) - self.right,
-                                "nothing given back, in the reference", used=False))
+                lambda g: integrals.lobe(single(g.roughness), mirrored(self.points.some(g.index)), g.count)
+            )
+            found.append(
+                self.entry(
+                    "mirror direction",
+                    "other",
+                    self.reads.weights(integrals.exact_table)[0] * (plain - integrals.own_view),
+                    "n = v = r read there, and nothing blended",
+                    used=False,
+                )
+            )
+        found.append(
+            self.entry(
+                "single scattering",
+                "other",
+                integrals.reference(again=False) - self.right,
+                "nothing given back, in the reference",
+                used=False,
+            )
+        )
         if (grooved := integrals.grooved()).any():
-            found.append(self.entry("Lambert", "other", grooved, "Oren and Nayar's grooves of the same roughness "
-                                    "(tan σ = α/√2) in its place", used=False))
-        found += [self.entry(f"masking {name}", "other", integrals.masked(name), f"{models('masking')[name].title}, in "
-                             "place of height-correlated Smith", used=False)
-                  for name in models("masking") if name != "smith"]
+            found.append(
+                self.entry(
+                    "Lambert",
+                    "other",
+                    grooved,
+                    "Oren and Nayar's grooves of the same roughness (tan σ = α/√2) in its place",
+                    used=False,
+                )
+            )
+        found += [
+            self.entry(
+                f"masking {name}",
+                "other",
+                integrals.masked(name),
+                f"{models('masking')[name].title}, in place of height-correlated Smith",
+                used=False,
+            )
+            for name in models("masking")
+            if name != "smith"
+        ]
         if (sheen := integrals.sheen()) is not None:
-            found.append(self.entry("split sum of sheen", "other", sheen, "Charlie's lobe from n = v = r, Smith's "
-                                    "masking", used=False))
+            found.append(
+                self.entry(
+                    "split sum of sheen", "other", sheen, "Charlie's lobe from n = v = r, Smith's masking", used=False
+                )
+            )
         return tuple(found)
 
 

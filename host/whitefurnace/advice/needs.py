@@ -1,5 +1,6 @@
 """Lists which parts of a bake a scene's materials can read, with the reason for each, and derives the smallest bake
 that has the needed ones."""
+
 from __future__ import annotations
 
 import json
@@ -165,23 +166,33 @@ def smallest(engine: Engine, full: Chain, found: Sequence[Lobe]) -> Chain:
 def diffuse_weight(engine: Engine, m: Material) -> float:
     """The largest factor by which the engine multiplies E/π for a material, over n·v and the material's roughness;
     light through the surface counts too."""
-    NoV, r = (x.ravel() for x in np.meshgrid(np.linspace(0.05, 1, 12), np.linspace(
-        max(m["roughness"].least, engine.least), max(m["roughness"].most, engine.least), 5)))
+    NoV, r = (
+        x.ravel()
+        for x in np.meshgrid(
+            np.linspace(0.05, 1, 12),
+            np.linspace(max(m["roughness"].least, engine.least), max(m["roughness"].most, engine.least), 5),
+        )
+    )
     A, B = karis(NoV, r)
     blend = np.broadcast_to(engine.blend_formula(r=r, alpha=r * r), r.shape)[:, None]
     most = m["diffuse_transmission"].most
     for metal in (m["metalness"].least, m["metalness"].most):
         color = np.array(m["base_color"].high) * (1 - m["transmission"].least * (1 - metal))
-        weights = SHADINGS[engine.shading](A[:, None], B[:, None], color[None], np.full((len(r), 1), metal),
-                                           r[:, None], NoV[:, None])
+        weights = SHADINGS[engine.shading](
+            A[:, None], B[:, None], color[None], np.full((len(r), 1), metal), r[:, None], NoV[:, None]
+        )
         most = max(most, float((weights[1] + weights[0] * blend).max()))
     return most
 
 
 def needs(scene: Scene, engine: Engine, *, background: bool = False) -> Needs:
     """The parts of an engine's bake that a scene needs. background: True if the environment itself is visible."""
-    full = chain(lods=engine.lods, usual_min=engine.min_size, size=engine.size,
-                 **({"levels": engine.levels} if engine.levels else {}))  # type: ignore[arg-type]
+    full = chain(
+        lods=engine.lods,
+        usual_min=engine.min_size,
+        size=engine.size,
+        **({"levels": engine.levels} if engine.levels else {}),
+    )  # type: ignore[arg-type]
     return _Deciding(scene, engine, full, background).made()
 
 
@@ -202,8 +213,21 @@ class _Deciding:
             why = "all of its materials are unlit" if self.scene.materials else "it has no materials"
             self.rows.append(Need("any light", "integral", False, why, _bytes(engine, full), 0))
             self._effects()
-            return Needs(engine, None, full, None, (), None, tuple(self.rows), (), None, 0, _bytes(engine, full), 0.0,
-                         seconds(engine, full))
+            return Needs(
+                engine,
+                None,
+                full,
+                None,
+                (),
+                None,
+                tuple(self.rows),
+                (),
+                None,
+                0,
+                _bytes(engine, full),
+                0.0,
+                seconds(engine, full),
+            )
         own_chain = self._chain()
         without = tuple(self._without())
         table = self._table_size() if "dfg" not in without else None
@@ -213,8 +237,21 @@ class _Deciding:
         tables = tuple(self._tables())
         cloth = self._cloth()
         self._effects()
-        return Needs(engine, own, full, own_chain, without, table, tuple(self.rows), tables, cloth,
-                     _bytes(own, own_chain), _bytes(engine, full), seconds(own, own_chain), seconds(engine, full))
+        return Needs(
+            engine,
+            own,
+            full,
+            own_chain,
+            without,
+            table,
+            tuple(self.rows),
+            tables,
+            cloth,
+            _bytes(own, own_chain),
+            _bytes(engine, full),
+            seconds(own, own_chain),
+            seconds(engine, full),
+        )
 
     # ------------------------------------------------------------------------------------------- the chain
 
@@ -257,10 +294,13 @@ class _Deciding:
         for k, (size, r) in enumerate(full.levels):
             last = k == len(full.levels) - 1 and self._last_is_diffuse()
             if shares[k] > 0:
-                first = min((lobe for lobe in self.lobes if read_shares([lobe], full)[k] > 0),
-                            key=lambda lobe: lobe.roughness.least)
-                reason = f"{shares[k]:.2g} of reads: " + _some(sorted({
-                    lobe.material for lobe in self.lobes if read_shares([lobe], full)[k] > 0}))
+                first = min(
+                    (lobe for lobe in self.lobes if read_shares([lobe], full)[k] > 0),
+                    key=lambda lobe: lobe.roughness.least,
+                )
+                reason = f"{shares[k]:.2g} of reads: " + _some(
+                    sorted({lobe.material for lobe in self.lobes if read_shares([lobe], full)[k] > 0})
+                )
                 reason += f", from r = {first.roughness.least:.2g}" if k == int(np.argmax(shares > 0)) else ""
             elif last:
                 reason = f"{engine.name} reads the diffuse light there"
@@ -270,9 +310,16 @@ class _Deciding:
                 reason = "no surface reads it" + ("; mips are all there" if engine.container == "files" else "")
             else:
                 reason = "no surface reads it"
-            self.rows.append(Need(f"level {k}, {size}², r = {r:.3g}", "level", bool(
-                shares[k] > 0 or last or (k == 0 and self.background)), reason, round(before * size * size / usual),
-                round(after * size * size / here) if k in made_of else 0))
+            self.rows.append(
+                Need(
+                    f"level {k}, {size}², r = {r:.3g}",
+                    "level",
+                    bool(shares[k] > 0 or last or (k == 0 and self.background)),
+                    reason,
+                    round(before * size * size / usual),
+                    round(after * size * size / here) if k in made_of else 0,
+                )
+            )
 
     def _last_is_diffuse(self) -> bool:
         engine = self.engine
@@ -287,20 +334,36 @@ class _Deciding:
             self.rows.append(Need(what, kind, needed, reason, before.get(holds, 0), after.get(holds, 0)))
 
         name, weight = max(self.diffuse, key=lambda one: one[1], default=("", 0.0))
-        why = (f"{name} weighs E/π by up to {weight:.2g}" if self.needs_diffuse else
-               f"no material weighs E/π by more than {weight:.1g}: metal, black or clear")
+        why = (
+            f"{name} weighs E/π by up to {weight:.2g}"
+            if self.needs_diffuse
+            else f"no material weighs E/π by more than {weight:.1g}: metal, black or clear"
+        )
         if engine.needs("irradiance"):
             row("irradiance", f"irradiance, {IRRADIANCE_SIZE}²", "integral", self.needs_diffuse, why)
         if engine.needs("sh"):
             stays = " (its container has coefficients all the same)" if own.sh and not self.needs_diffuse else ""
             row("sh", "irradiance harmonics", "integral", self.needs_diffuse, why + stays)
         if engine.holding("environment"):
-            row("environment", "the image as a lat-long", "file", True,
-                f"{engine.name} filters it itself" if not engine.holding("specular") else
-                f"where {engine.name} filters it itself")
+            row(
+                "environment",
+                "the image as a lat-long",
+                "file",
+                True,
+                f"{engine.name} filters it itself"
+                if not engine.holding("specular")
+                else f"where {engine.name} filters it itself",
+            )
         if engine.holding("skybox"):
-            row("skybox", "skybox", "file", self.background, "the background, as --background says" if self.background
-                else "no material reads it; --background where the environment is seen")
+            row(
+                "skybox",
+                "skybox",
+                "file",
+                self.background,
+                "the background, as --background says"
+                if self.background
+                else "no material reads it; --background where the environment is seen",
+            )
         if engine.holding("sheen"):
             row("sheen", "Charlie's chain", "lobe", bool(self.sheens), _sheen_text(self.sheens))
         if not engine.needs("dfg"):
@@ -313,8 +376,10 @@ class _Deciding:
         reason = f"every reflection reads it, from r = {least:.2g}"
         if own.dfg.size != engine.dfg.size:
             size = own.dfg.size
-            reason += (f": {size}² are read within {NEGLIGIBLE:.1g} (p99) at any, {engine.name} has "
-                       f"{engine.dfg.size}²; --table {size}")
+            reason += (
+                f": {size}² are read within {NEGLIGIBLE:.1g} (p99) at any, {engine.name} has "
+                f"{engine.dfg.size}²; --table {size}"
+            )
         row("dfg", f"split-sum table, {size}²", "table", True, reason)
         if engine.dfg.charlie and engine.holding("dfg"):
             self.rows.append(Need("Charlie's albedo in it", "table", bool(self.sheens), _sheen_text(self.sheens)))
@@ -329,55 +394,108 @@ class _Deciding:
                 who = _some([m.name for m in rough if m["ior"].most == ior])
                 if ior <= 1:
                     continue
-                self.rows.append(Need(f"glass table, n = {ior:g}, {GLASS}²", "table", True if free else None,
-                                      f"what rough {who} reflects and lets through" if free else
-                                      f"{who} is rough glass; {self.engine.name} reads no such table",
-                                      kept=GLASS * GLASS * 8 if free else 0))
+                self.rows.append(
+                    Need(
+                        f"glass table, n = {ior:g}, {GLASS}²",
+                        "table",
+                        True if free else None,
+                        f"what rough {who} reflects and lets through"
+                        if free
+                        else f"{who} is rough glass; {self.engine.name} reads no such table",
+                        kept=GLASS * GLASS * 8 if free else 0,
+                    )
+                )
                 if free:
                     yield {"kind": "glass", "output": f"glass_{ior:g}.npy", "size": GLASS, "set": [f"ior={ior:g}"]}
         else:
-            self.rows.append(Need("glass tables", "table", False, "nothing transmits" if not clear else
-                                  "what transmits is smooth: Fresnel's equations alone"))
+            self.rows.append(
+                Need(
+                    "glass tables",
+                    "table",
+                    False,
+                    "nothing transmits" if not clear else "what transmits is smooth: Fresnel's equations alone",
+                )
+            )
         if self.sheens and free:
-            self.rows.append(Need("sheen table, 64²", "table", True, f"what {_names(self.sheens)} leaves to the layer "
-                                  "under it", kept=64 * 64 * 8))
+            self.rows.append(
+                Need(
+                    "sheen table, 64²",
+                    "table",
+                    True,
+                    f"what {_names(self.sheens)} leaves to the layer under it",
+                    kept=64 * 64 * 8,
+                )
+            )
             yield {"kind": "sheen", "output": "sheen.npy", "size": 64}
         self.rows.append(Need("linearly transformed cosines", "table", False, "glTF has no area lights"))
         if self.scene.lights:
-            self.rows.append(Need("tables for punctual lights", "table", False,
-                                  f"its {self.scene.lights} are delta lights: shaders evaluate the BRDF"))
+            self.rows.append(
+                Need(
+                    "tables for punctual lights",
+                    "table",
+                    False,
+                    f"its {self.scene.lights} are delta lights: shaders evaluate the BRDF",
+                )
+            )
 
     def _cloth(self) -> dict[str, Any] | None:
         if not self.sheens or self.engine.container == "files":
             if self.sheens and not self.engine.holding("sheen"):
-                self.rows.append(Need("Charlie's chain", "lobe", None,
-                                      f"{_sheen_text(self.sheens)}; {self.engine.name} reads no such chain"))
+                self.rows.append(
+                    Need(
+                        "Charlie's chain",
+                        "lobe",
+                        None,
+                        f"{_sheen_text(self.sheens)}; {self.engine.name} reads no such chain",
+                    )
+                )
             return None
         usual = replace(self.full, ndf=chosen("ndf", "charlie"))
         made = self.full if self.background else smallest(self.engine, usual, self.sheens)
         without = ["irradiance", "sh", "dfg"]
-        self.rows.append(Need("Charlie's chain", "lobe", True, _sheen_text(self.sheens),
-                              kept=_bytes(reduced(self.engine, without), made)))
+        self.rows.append(
+            Need(
+                "Charlie's chain",
+                "lobe",
+                True,
+                _sheen_text(self.sheens),
+                kept=_bytes(reduced(self.engine, without), made),
+            )
+        )
         only = {"only_levels": only_text(made)} if made.only else {}
         return {"ndf": "charlie", **only, "without": without}
 
     def _effects(self) -> None:
         """Adds rows for effects of the materials that no table of an environment gives."""
+
         def add(what: str, which: Sequence[Material], reason: str) -> None:
             if which:
                 self.rows.append(Need(what, "effect", None, f"{_some([m.name for m in which])}: {reason}"))
 
-        add("iridescence", [m for m in self.lit if m["iridescence"].most > 0],
+        add(
+            "iridescence",
+            [m for m in self.lit if m["iridescence"].most > 0],
             "its Fresnel term turns with the angle and the film, the split sum is of Schlick's with F90 = 1: an "
-            "average F0 is all that it can be given")
+            "average F0 is all that it can be given",
+        )
         thick = [m for m in self.lit if m["transmission"].most > 0 and m["thickness"].most > 0]
-        add("refraction with volume", thick, "where light leaves depends on the shape, no table of an environment "
-            "holds that; engines read the chain, or the picture behind, along one refracted ray")
-        add("absorption", [m for m in thick if math.isfinite(m["attenuation_distance"].least)],
-            "Beer's law along that ray, in the shader: no table")
+        add(
+            "refraction with volume",
+            thick,
+            "where light leaves depends on the shape, no table of an environment "
+            "holds that; engines read the chain, or the picture behind, along one refracted ray",
+        )
+        add(
+            "absorption",
+            [m for m in thick if math.isfinite(m["attenuation_distance"].least)],
+            "Beer's law along that ray, in the shader: no table",
+        )
         add("dispersion", [m for m in self.lit if m["dispersion"].most > 0], "one refracted ray a colour: no table")
-        add("anisotropy", [m for m in self.lit if m["anisotropy"].most > 0],
-            "only isotropic lobes can be prefiltered: engines read that of r along a bent direction")
+        add(
+            "anisotropy",
+            [m for m in self.lit if m["anisotropy"].most > 0],
+            "only isotropic lobes can be prefiltered: engines read that of r along a bent direction",
+        )
         strong = [m for m in self.scene.materials if m["emission"].most * m["emissive_strength"].most > 1]
         add("light of its own", strong, "it is seen, and lights nothing else: it is not in the environment")
         for m in self.lit:
@@ -442,8 +560,15 @@ def bakes(found: Needs, output: str) -> list[dict[str, Any]]:
     return made
 
 
-def write_job(path: str | os.PathLike[str], found: Needs, name: str, scene: str, environments: Sequence[str], *,
-              force: bool = False) -> None:
+def write_job(
+    path: str | os.PathLike[str],
+    found: Needs,
+    name: str,
+    scene: str,
+    environments: Sequence[str],
+    *,
+    force: bool = False,
+) -> None:
     """Write a job for `batch` that bakes what a scene needs.
 
     path: a .toml file. Outputs go into a folder of its name next to it. name: the engine as --for takes it.
@@ -460,7 +585,8 @@ def write_job(path: str | os.PathLike[str], found: Needs, name: str, scene: str,
     tables = [("bake", {"environments": sources, "for": [engine], **one}) for one in bakes(found, path.stem)]
     tables += [("lut", {**one, "output": f"{path.stem}/{one['output']}"}) for one in found.tables]
     text = f"# What {_plain(scene)} needs of {_plain(found.engine.name)}, as `whitefurnace scene` says.\n" + "".join(
-        f"\n[[{kind}]]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in one.items()) for kind, one in tables)
+        f"\n[[{kind}]]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in one.items()) for kind, one in tables
+    )
     try:
         there = path.read_bytes() if path.exists() else None
     except OSError as error:

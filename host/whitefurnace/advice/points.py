@@ -1,4 +1,5 @@
 """Draws the surface points on which the error of a bake is measured, from the materials of a glTF scene."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -91,8 +92,16 @@ def sample_points(scene: Scene, *, least: float = 0.0, count: int = POINTS, seed
     across /= np.sqrt((across * across).sum(0))
     NoV = np.maximum(np.sqrt((rng.permutation(count) + rng.random(count)) / count), GRAZING)
     v = NoV * n + np.sqrt((1 - NoV) * (1 + NoV)) * across
-    return ScenePoints(place, color, metal, _fewer(r, NODES), f0, _fewer(ior, IORS), Points(n, v),
-                       tuple(_left_out(scene, there, least)))
+    return ScenePoints(
+        place,
+        color,
+        metal,
+        _fewer(r, NODES),
+        f0,
+        _fewer(ior, IORS),
+        Points(n, v),
+        tuple(_left_out(scene, there, least)),
+    )
 
 
 def _drawn(spread: Spread, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -130,14 +139,21 @@ def _left_out(scene: Scene, there: Sequence[int], least: float) -> list[str]:
     """Notices about the parts of the lit materials `there` that the points do not have."""
     found = []
     shaded = [scene.materials[k] for k in there]
-    for name, what in (("clearcoat", "clear coat"), ("transmission", "transmission"), ("anisotropy", "anisotropy"),
-                       ("iridescence", "iridescence"), ("diffuse_transmission", "diffuse transmission")):
+    for name, what in (
+        ("clearcoat", "clear coat"),
+        ("transmission", "transmission"),
+        ("anisotropy", "anisotropy"),
+        ("iridescence", "iridescence"),
+        ("diffuse_transmission", "diffuse transmission"),
+    ):
         who = [m.name for m in shaded if m[name].most > 0]
         if who:
-            found.append(f"the {what} of {who[0]}{f' and {len(who) - 1} more' if len(who) > 1 else ''} is not in the "
-                         "budget: what is measured is the surface under it" if name == "clearcoat" else
-                         f"the {what} of {who[0]}{f' and {len(who) - 1} more' if len(who) > 1 else ''} is not in the "
-                         "budget")
+            found.append(
+                f"the {what} of {who[0]}{f' and {len(who) - 1} more' if len(who) > 1 else ''} is not in the "
+                "budget: what is measured is the surface under it"
+                if name == "clearcoat"
+                else f"the {what} of {who[0]}{f' and {len(who) - 1} more' if len(who) > 1 else ''} is not in the budget"
+            )
     if any(m["specular"].least < 1 for m in shaded):
         found.append("a specular factor below 1 scales F0 here, and not F90")
     if least > 0 and any(m["roughness"].least < least for m in shaded):

@@ -1,5 +1,6 @@
 """Computes the light that an engine reads from its files at the points of a scene, and the picture that it makes of
 it."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -42,8 +43,13 @@ class Storage:
             return cls("float32", "float32", ("sh" if "irradiance" in engine.without else "cube", "float32"))
         files = {holds: engine.holding(holds) for holds in ("specular", "skybox", "dfg", "irradiance")}
         levels = (files["specular"] or files["skybox"])[0].stored
-        diffuse = ("sh", "float32") if engine.sh else \
-            ("cube", files["irradiance"][0].stored) if files["irradiance"] else ("level", levels)
+        diffuse = (
+            ("sh", "float32")
+            if engine.sh
+            else ("cube", files["irradiance"][0].stored)
+            if files["irradiance"]
+            else ("level", levels)
+        )
         return cls(levels, files["dfg"][0].stored if files["dfg"] else None, diffuse)
 
 
@@ -73,7 +79,8 @@ class EngineReads:
     def prefiltered(self) -> np.ndarray:
         """Exact prefiltered radiance (n = v = r) in the directions that the engine reads."""
         return self.integrals.each(
-            lambda g: self.integrals.lobe(single(g.roughness), self.looked_up[:, g.index], g.count))
+            lambda g: self.integrals.lobe(single(g.roughness), self.looked_up[:, g.index], g.count)
+        )
 
     @cached_property
     def blend(self) -> np.ndarray:
@@ -87,8 +94,15 @@ class EngineReads:
         table: the split-sum terms (A, B), (m,) each.
         """
         s = self.sampled
-        made = shading.SHADINGS[self.engine.shading](table[0][:, None], table[1][:, None], s.color, s.metal[:, None],
-                                                     s.roughness[:, None], self.points.NoV[:, None], s.f0)
+        made = shading.SHADINGS[self.engine.shading](
+            table[0][:, None],
+            table[1][:, None],
+            s.color,
+            s.metal[:, None],
+            s.roughness[:, None],
+            self.points.NoV[:, None],
+            s.f0,
+        )
         return np.broadcast_to(made[0], s.color.shape), np.broadcast_to(made[1], s.color.shape)
 
     def shown(self, radiance: np.ndarray, diffuse: np.ndarray, table: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
@@ -128,15 +142,20 @@ class EngineReads:
         if key not in self._reads:
             self.bake([recipe])
             levels = as_stored([level.texels for level in self._lights[key[0]][1].levels], form)
-            self._reads[key] = shading.specular(self.engine, Lights(tuple(levels)), self.points.n, self.points.v,
-                                                self.sampled.roughness)
+            self._reads[key] = shading.specular(
+                self.engine, Lights(tuple(levels)), self.points.n, self.points.v, self.sampled.roughness
+            )
         return self._reads[key]
 
     def between(self, recipe: Chain) -> np.ndarray:
         """(m, 3) prefiltered radiance as it is read between levels that have exact values in every direction."""
         own = [single(r) for _, r in recipe.levels]
-        mixtures = [mixture or lobe for mixture, lobe in zip(
-            read_mixtures(self.device, recipe) if recipe.fit else [None] * len(own), own, strict=True)]
+        mixtures = [
+            mixture or lobe
+            for mixture, lobe in zip(
+                read_mixtures(self.device, recipe) if recipe.fit else [None] * len(own), own, strict=True
+            )
+        ]
         lod = shading.lods(self.engine, self.sampled.roughness, len(own), recipe.size)
         value = np.zeros_like(self.sampled.color)
         for k, mixture in enumerate(mixtures):
@@ -146,8 +165,11 @@ class EngineReads:
                 d = self.looked_up[:, some]
                 # The last mips of an engine that follows its lod are rougher than 1; only the prefilter integrates
                 # such lobes.
-                level = self.integrals.lobe(mixture, d, 0) if max(r for _, r in mixture) <= 1 else \
-                    Exact(self.device, self.env, recipe).lobes([(tuple(mixture), d)])[0]
+                level = (
+                    self.integrals.lobe(mixture, d, 0)
+                    if max(r for _, r in mixture) <= 1
+                    else Exact(self.device, self.env, recipe).lobes([(tuple(mixture), d)])[0]
+                )
                 value[some] += weight[some, None] * level
         return value
 
@@ -206,8 +228,10 @@ class EngineReads:
         return self.shown(
             self.read(recipe, "float32" if "format" in but else storage.chain),
             self.integrals.diffuse if "diffuse" in but else self.diffuse_read(recipe, *storage.diffuse),
-            self.integrals.exact_table if "table" in but else
-            self.table(None if storage.table is None else engine.dfg, storage.table))
+            self.integrals.exact_table
+            if "table" in but
+            else self.table(None if storage.table is None else engine.dfg, storage.table),
+        )
 
 
 def key_of(recipe: Chain) -> str:
@@ -228,7 +252,7 @@ def as_stored(levels: Sequence[np.ndarray], form: str, *, cube: bool = True) -> 
         return [decode(made, k)[..., :3] for k in range(len(levels))]
     if form == "rgba16f":
         return [stored(level, "float16") for level in levels]
-    return [unpack(form, pack(form, level).data, level.shape[:-1])[..., :level.shape[-1]] for level in levels]
+    return [unpack(form, pack(form, level).data, level.shape[:-1])[..., : level.shape[-1]] for level in levels]
 
 
 def writable_formats(file: File) -> list[str]:

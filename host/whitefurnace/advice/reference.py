@@ -1,4 +1,5 @@
 """Integrates the light that the points of a scene reflect, without any approximation of an engine or of files."""
+
 from __future__ import annotations
 
 import math
@@ -193,8 +194,11 @@ class PointIntegrals:
         s = self.sampled
         made = np.empty((len(s.roughness), 2, 3))
         for g in self.groups:
-            made[g.index] = g.R if g.roughness == 0 else self.truth.reflected(
-                _schlick(g.roughness, masking), self.points.some(g.index), g.count)[0]
+            made[g.index] = (
+                g.R
+                if g.roughness == 0
+                else self.truth.reflected(_schlick(g.roughness, masking), self.points.some(g.index), g.count)[0]
+            )
         m = s.metal[:, None]
         F0 = (1 - m) * s.f0 + m * s.color
         R, _ = self.reflected(F0)
@@ -214,9 +218,14 @@ class PointIntegrals:
             if g.roughness == 0 or not (rest[g.index] * s.color[g.index]).any():
                 continue
             sigma = math.atan(g.roughness**2 / math.sqrt(2))
-            half, full = (self.truth.reflected(term(diffuse="oren_nayar", diffuse_albedo=rho,
-                                                    diffuse_sigma=np.full(2, sigma)),
-                                               self.points.some(g.index), g.count)[0][:, k] for k in (0, 1))
+            half, full = (
+                self.truth.reflected(
+                    term(diffuse="oren_nayar", diffuse_albedo=rho, diffuse_sigma=np.full(2, sigma)),
+                    self.points.some(g.index),
+                    g.count,
+                )[0][:, k]
+                for k in (0, 1)
+            )
             a = 4 * half - full
             c = s.color[g.index]
             out[g.index] = rest[g.index] * (a * c + (full - a) * c * c - c * self.diffuse[g.index])
@@ -238,8 +247,9 @@ class PointIntegrals:
             points = self.points.some(index)
             R, E = self.truth.reflected(term(ndf="charlie", roughness=r), points, self._least_count)
             d = mirrored(points)
-            levels, own = self.truth.reflected(term(ndf="charlie", roughness=r, masking="implicit"), Points(d, d),
-                                               self._least_count)
+            levels, own = self.truth.reflected(
+                term(ndf="charlie", roughness=r, masking="implicit"), Points(d, d), self._least_count
+            )
             out[index] = middle(m["sheen_color"]) * (E * levels[:, 0] / own - R[:, 0])
         return out if some and out.any() else None
 

@@ -1,4 +1,5 @@
 """Bakes environments into the files that engines load: plans, reads, computes and writes each of them."""
+
 from __future__ import annotations
 
 import contextlib
@@ -72,9 +73,18 @@ def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
     image = device.empty((height, 2 * height, 3), np.float32)
     count = -(-2 * height * height // size) * size
     sun = [math.sin(theta) * math.cos(phi), math.cos(theta), math.sin(theta) * math.sin(phi)]
-    device.launch(program.kernel("demo"), (count,),
-                  (image, np.int32(height), np.int32(4), *(np.float32(x) for x in sun),
-                   np.float32(math.cos(SUN_RADIUS)), np.float32(SUN_RADIANCE)))
+    device.launch(
+        program.kernel("demo"),
+        (count,),
+        (
+            image,
+            np.int32(height),
+            np.int32(4),
+            *(np.float32(x) for x in sun),
+            np.float32(math.cos(SUN_RADIUS)),
+            np.float32(SUN_RADIANCE),
+        ),
+    )
     return replace(environment(image.read()), name=DEMO)
 
 
@@ -154,10 +164,20 @@ def plan(request: BakeRequest) -> BakePlan:
     found = engines(request.for_)
     if left_out or request.table is not None:
         found = tuple(reduced(e, left_out, request.table) for e in found)
-    return BakePlan(tuple(names), tuple(request.sources), Path(request.output), found,
-                    tuple(_chain(e, request) for e in found), float(request.rotate), float(request.exposure),
-                    request.nonfinite, request.sun, request.force, bool(request.as_read) or request.fit is not None,
-                    window)
+    return BakePlan(
+        tuple(names),
+        tuple(request.sources),
+        Path(request.output),
+        found,
+        tuple(_chain(e, request) for e in found),
+        float(request.rotate),
+        float(request.exposure),
+        request.nonfinite,
+        request.sun,
+        request.force,
+        bool(request.as_read) or request.fit is not None,
+        window,
+    )
 
 
 def name_of(item: Any) -> str:
@@ -194,9 +214,20 @@ def _chain(engine: Engine, request: BakeRequest) -> Chain:
         if engine.levels and request.min_size is None and levels is None:
             levels = min(engine.levels, int(size).bit_length())
     try:
-        return chain(ndf=request.ndf, size=size, min_size=request.min_size, tolerance=request.tolerance,
-                     quality=request.quality, levels=levels, fit=request.fit, samples=request.samples,
-                     certify=request.certify, lods=engine.lods, usual_min=usual, only_levels=request.only_levels)
+        return chain(
+            ndf=request.ndf,
+            size=size,
+            min_size=request.min_size,
+            tolerance=request.tolerance,
+            quality=request.quality,
+            levels=levels,
+            fit=request.fit,
+            samples=request.samples,
+            certify=request.certify,
+            lods=engine.lods,
+            usual_min=usual,
+            only_levels=request.only_levels,
+        )
     except UsageError as error:
         raise error if engine.container != "files" else UsageError(f"{engine.name}: {error}") from None
 
@@ -206,14 +237,34 @@ def _is_demo(item: Any) -> bool:
     return str(item) == DEMO and not os.path.exists(item)
 
 
-def bake(sources: Source | Sequence[Source], output: str | os.PathLike[str], *, for_: str = "raw",
-         size: int | None = None, min_size: int | None = None, levels: int | None = None,
-         only_levels: str | None = None, without: str | Sequence[str] = (), table: int | None = None,
-         ndf: Spec = "ggx", tolerance: float | None = None, quality: str | None = None, samples: int | None = None,
-         certify: int = CERTIFIED, fit: str | None = None, as_read: bool = False, rotate: float = 0.0,
-         exposure: float = 0.0, nonfinite: str = "refuse", sun: str = "keep", sh: str | None = None,
-         force: bool = False, device: Device | str | None = None, dry_run: bool = False,
-         progress: Callable[[str, str, float], None] | None = None) -> list[Baked]:
+def bake(
+    sources: Source | Sequence[Source],
+    output: str | os.PathLike[str],
+    *,
+    for_: str = "raw",
+    size: int | None = None,
+    min_size: int | None = None,
+    levels: int | None = None,
+    only_levels: str | None = None,
+    without: str | Sequence[str] = (),
+    table: int | None = None,
+    ndf: Spec = "ggx",
+    tolerance: float | None = None,
+    quality: str | None = None,
+    samples: int | None = None,
+    certify: int = CERTIFIED,
+    fit: str | None = None,
+    as_read: bool = False,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: str = "refuse",
+    sun: str = "keep",
+    sh: str | None = None,
+    force: bool = False,
+    device: Device | str | None = None,
+    dry_run: bool = False,
+    progress: Callable[[str, str, float], None] | None = None,
+) -> list[Baked]:
     """Bake environments into the files that engines load, each with its stated error.
 
     sources: a path, an array, an `environment`, or a list of them; the word `demo` is the built-in sky.
@@ -238,15 +289,44 @@ def bake(sources: Source | Sequence[Source], output: str | os.PathLike[str], *, 
     environment that fails.
     """
     several: Sequence[Source] = (
-        [sources] if isinstance(sources, (str, os.PathLike, np.ndarray, Environment)) else list(sources))
-    asked = BakeRequest(several, output, for_, size, min_size, levels, only_levels, without, table, ndf, tolerance,
-                        quality, samples, certify, fit, as_read, rotate, exposure, nonfinite, sun, sh, force)
+        [sources] if isinstance(sources, (str, os.PathLike, np.ndarray, Environment)) else list(sources)
+    )
+    asked = BakeRequest(
+        several,
+        output,
+        for_,
+        size,
+        min_size,
+        levels,
+        only_levels,
+        without,
+        table,
+        ndf,
+        tolerance,
+        quality,
+        samples,
+        certify,
+        fit,
+        as_read,
+        rotate,
+        exposure,
+        nonfinite,
+        sun,
+        sh,
+        force,
+    )
     planned = plan(asked)
     return [bake_one(planned, k, device, dry_run=dry_run, progress=progress) for k in range(len(planned.names))]
 
 
-def bake_one(request: BakePlan, k: int, device: Device | str | None = None, *, dry_run: bool = False,
-             progress: Callable[[str, str, float], None] | None = None) -> Baked:
+def bake_one(
+    request: BakePlan,
+    k: int,
+    device: Device | str | None = None,
+    *,
+    dry_run: bool = False,
+    progress: Callable[[str, str, float], None] | None = None,
+) -> Baked:
     """Bake the k-th environment of a plan. Raises what `bake` raises."""
     found = read(request, k, device, dry_run=dry_run)
     if isinstance(found, Baked):
@@ -334,8 +414,13 @@ def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: 
     """The item as its manifest states it, where that proves it whole and has the key of these source bytes: a skip
     costs reading them, not decoding them."""
     item, stated = request.sources[k], (there or {}).get("source")
-    if request.force or there is None or not isinstance(stated, dict) or not isinstance(item, (str, os.PathLike)) or \
-            _is_demo(item):
+    if (
+        request.force
+        or there is None
+        or not isinstance(stated, dict)
+        or not isinstance(item, (str, os.PathLike))
+        or _is_demo(item)
+    ):
         return None
     try:
         digest = source_digest(item)
@@ -346,9 +431,17 @@ def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: 
     if there.get("key") != _key(digest, recipe) or not _output(request, k).is_whole(there):
         return None
     written = targets_of(request, request.names[k])
-    return Baked(request.names[k], "skipped", tuple(t.path for t in written), there, (),
-                 tuple(t.nbytes for t in written), tuple(stated.get("notices", ())), tuple(there.get("levels", ())),
-                 time.perf_counter() - begin)
+    return Baked(
+        request.names[k],
+        "skipped",
+        tuple(t.path for t in written),
+        there,
+        (),
+        tuple(t.nbytes for t in written),
+        tuple(stated.get("notices", ())),
+        tuple(there.get("levels", ())),
+        time.perf_counter() - begin,
+    )
 
 
 def read(request: BakePlan, k: int, device: Device | str | None = None, *, dry_run: bool = False) -> Baked | Loaded:
@@ -386,16 +479,22 @@ def read(request: BakePlan, k: int, device: Device | str | None = None, *, dry_r
         return loaded
 
 
-def _read(request: BakePlan, k: int, device: Device | str | None, lock: Lock | None, made: tuple[Path, ...],
-          there: dict[str, Any] | None, begin: float) -> Baked | Loaded:
+def _read(
+    request: BakePlan,
+    k: int,
+    device: Device | str | None,
+    lock: Lock | None,
+    made: tuple[Path, ...],
+    there: dict[str, Any] | None,
+    begin: float,
+) -> Baked | Loaded:
     name, item, output = request.names[k], request.sources[k], _output(request, k)
     on: Device | None = device if isinstance(device, Device) else None
     if _is_demo(item):
         on = on or choose_device(device if isinstance(device, str) else None)
         item = demo(on)
     # With its rotation and exposure applied: the kernels see the environment only through these.
-    env = environment(item, rotate=request.rotate, exposure=request.exposure,
-                      nonfinite=request.nonfinite)  # type: ignore[arg-type]
+    env = environment(item, rotate=request.rotate, exposure=request.exposure, nonfinite=request.nonfinite)  # type: ignore[arg-type]
     env, sun = without_sun(env, request.sun)
     recipe = _canonical(request, env.rotation, env.exposure)
     key = _key(env.digest, recipe)
@@ -404,13 +503,31 @@ def _read(request: BakePlan, k: int, device: Device | str | None, lock: Lock | N
     files = tuple(t.path for t in written)
     sizes = tuple(t.nbytes for t in written)
     if not request.force and there and there.get("key") == key and output.is_whole(there):
-        return Baked(name, "skipped", files, there, planned, sizes, env.notices,
-                     tuple(there.get("levels", ())), time.perf_counter() - begin)
+        return Baked(
+            name,
+            "skipped",
+            files,
+            there,
+            planned,
+            sizes,
+            env.notices,
+            tuple(there.get("levels", ())),
+            time.perf_counter() - begin,
+        )
     output.check(files, there, request.force)
     if lock is None:
         shown, notices = _would_read(request, env, device, on)
-        return Baked(name, "planned", files, {"key": key, "recipe": recipe}, planned, sizes, (*env.notices, *notices),
-                     as_read=shown, programs=_programs(request, env))
+        return Baked(
+            name,
+            "planned",
+            files,
+            {"key": key, "recipe": recipe},
+            planned,
+            sizes,
+            (*env.notices, *notices),
+            as_read=shown,
+            programs=_programs(request, env),
+        )
     for engine in request.engines:
         for file in engine.file:
             require_encoder(file.stored)  # before minutes of work, not when the file is written
@@ -433,8 +550,9 @@ def abandon(found: Loaded | Computed, *, folders: bool = False) -> None:
     _give_up(loaded.lock, loaded.made if folders else ())
 
 
-def compute(loaded: Loaded, device: Device | str | None = None,
-            progress: Callable[[str, str, float], None] | None = None) -> Computed:
+def compute(
+    loaded: Loaded, device: Device | str | None = None, progress: Callable[[str, str, float], None] | None = None
+) -> Computed:
     """Do all of the device's work for an environment.
 
     progress: as for `bake`. Raises CheckError, DeviceError, UnsupportedError.
@@ -459,13 +577,24 @@ def compute(loaded: Loaded, device: Device | str | None = None,
 def _encoded(made: Computed) -> list[Encoded]:
     """The files of every engine, ready to be written."""
     loaded, request = made.loaded, made.loaded.request
-    provenance = {"version": VERSION, "key": loaded.key, "source": loaded.env.digest,
-                  "recipe": json.dumps(loaded.recipe, sort_keys=True)}
+    provenance = {
+        "version": VERSION,
+        "key": loaded.key,
+        "source": loaded.env.digest,
+        "recipe": json.dumps(loaded.recipe, sort_keys=True),
+    }
     written: list[Encoded] = []
     for e, engine in enumerate(request.engines):
         own, sheen = made.of[e]
-        parts = Made(made.lit, made.lit.chains[own], made.lit.chains[sheen] if engine.holding("sheen") else None,
-                     made.table, made.splits[e], made.window, provenance)
+        parts = Made(
+            made.lit,
+            made.lit.chains[own],
+            made.lit.chains[sheen] if engine.holding("sheen") else None,
+            made.table,
+            made.splits[e],
+            made.window,
+            provenance,
+        )
         written += encoded(engine, request.chains[e], request.output, request.names[loaded.k], parts)
     return written
 
@@ -486,8 +615,9 @@ def _write(made: Computed) -> Baked:
     loaded, request, lit = made.loaded, made.loaded.request, made.lit
     name = request.names[loaded.k]
     written = _encoded(made) if made.written is None else made.written
-    manifest = _manifest(request, name, loaded.env, loaded.sun, loaded.recipe, loaded.key, made.on, lit, made.of,
-                         made.table, made.window)
+    manifest = _manifest(
+        request, name, loaded.env, loaded.sun, loaded.recipe, loaded.key, made.on, lit, made.of, made.table, made.window
+    )
     if request.as_read:
         manifest["as_read"] = made.as_read
     for folder in {target.path.parent for target in written}:  # another item's failure may have removed it
@@ -497,28 +627,42 @@ def _write(made: Computed) -> Baked:
         for target in written:
             target.write(transaction)
             digests[target.path.relative_to(request.output).as_posix()] = {
-                **target.stated, "sha256": digest_file(transaction.staged(target.path)),
-                "bytes": transaction.staged(target.path).stat().st_size}
+                **target.stated,
+                "sha256": digest_file(transaction.staged(target.path)),
+                "bytes": transaction.staged(target.path).stat().st_size,
+            }
         manifest["files"] = digests
         stale, manifest["kept"] = loaded.output.superseded(loaded.there, digests)
         write_manifest(loaded.output.path, manifest, into=transaction)
         transaction.commit(stale)
     seconds = [level.seconds for level, *_ in _rows_of(request, lit, made.of, "levels")]
     rows = tuple({**row, "seconds": s} for row, s in zip(manifest["levels"], seconds, strict=True))
-    return Baked(name, "done", tuple(t.path for t in written), manifest, loaded.planned,
-                 tuple(t.nbytes for t in written),
-                 (*loaded.env.notices, *made.table.notices, *format_notices(manifest)), rows,
-                 time.perf_counter() - loaded.begin, tuple(manifest.get("as_read", ())))
+    return Baked(
+        name,
+        "done",
+        tuple(t.path for t in written),
+        manifest,
+        loaded.planned,
+        tuple(t.nbytes for t in written),
+        (*loaded.env.notices, *made.table.notices, *format_notices(manifest)),
+        rows,
+        time.perf_counter() - loaded.begin,
+        tuple(manifest.get("as_read", ())),
+    )
 
 
 def targets_of(request: BakePlan, name: str) -> list[Target]:
     """The planned files of every engine, for an environment of that name."""
-    return [target for engine, recipe in zip(request.engines, request.chains, strict=True)
-            for target in targets(engine, recipe, request.output, name)]
+    return [
+        target
+        for engine, recipe in zip(request.engines, request.chains, strict=True)
+        for target in targets(engine, recipe, request.output, name)
+    ]
 
 
 def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
     """The chains to make, equal ones once, and for each engine the places of its own and of Charlie's in them."""
+
     def most(a: int | None, b: int | None) -> int | None:
         return None if a is None or b is None else max(a, b)  # None: all
 
@@ -526,27 +670,41 @@ def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
     of = []
     for engine, recipe in zip(request.engines, request.chains, strict=True):
         places = []
-        own = Want(recipe, None if engine.cubes("specular") else 0,
-                   None if engine.latlong else min(len(engine.holding("environment")), 1),
-                   None if engine.octahedral else 0)
-        sheen = Want(replace(recipe, ndf=chosen("ndf", "charlie"), fit=None,
-                             tolerance=min(SHEEN * recipe.tolerance, TOLERANCE_RANGE[1])),
-                     None if engine.holding("sheen") else 0)
+        own = Want(
+            recipe,
+            None if engine.cubes("specular") else 0,
+            None if engine.latlong else min(len(engine.holding("environment")), 1),
+            None if engine.octahedral else 0,
+        )
+        sheen = Want(
+            replace(
+                recipe,
+                ndf=chosen("ndf", "charlie"),
+                fit=None,
+                tolerance=min(SHEEN * recipe.tolerance, TOLERANCE_RANGE[1]),
+            ),
+            None if engine.holding("sheen") else 0,
+        )
         for want in (own, sheen):
             place = next((k for k, other in enumerate(wants) if other.recipe == want.recipe), len(wants))
             if place == len(wants):
                 wants.append(want)
             else:
                 old = wants[place]
-                wants[place] = Want(want.recipe, most(old.cubes, want.cubes), most(old.latlongs, want.latlongs),
-                                    most(old.octahedral, want.octahedral))
+                wants[place] = Want(
+                    want.recipe,
+                    most(old.cubes, want.cubes),
+                    most(old.latlongs, want.latlongs),
+                    most(old.octahedral, want.octahedral),
+                )
             places.append(place)
         of.append((places[0], places[1]))
     return wants, of
 
 
-def _rows_of(request: BakePlan, lit: Lighting, of: Sequence[tuple[int, int]],
-             name: str) -> list[tuple[Level, float | None, str, tuple[str, ...]]]:
+def _rows_of(
+    request: BakePlan, lit: Lighting, of: Sequence[tuple[int, int]], name: str
+) -> list[tuple[Level, float | None, str, tuple[str, ...]]]:
     """Each distinct level of `name`, a field of Filtered, from large to small and from smooth to rough.
 
     With it: the energy that it keeps (of "levels" alone), its NDF and the engines it is for.
@@ -599,8 +757,14 @@ def planned_levels(request: BakePlan, texel: float) -> tuple[tuple[tuple[str, ..
     return tuple((tuple(sorted(names)), level) for names, level in rows)
 
 
-def _as_read(request: BakePlan, on: Device, env: Environment, lit: Lighting, of: Sequence[tuple[int, int]],
-             written: Sequence[Encoded]) -> list[dict[str, Any]]:
+def _as_read(
+    request: BakePlan,
+    on: Device,
+    env: Environment,
+    lit: Lighting,
+    of: Sequence[tuple[int, int]],
+    written: Sequence[Encoded],
+) -> list[dict[str, Any]]:
     """Errors of each engine's chain after its sampling, in its mapping and from its format."""
     rows: list[dict[str, Any]] = []
     read = [e for e, engine in enumerate(request.engines) if engine.cubes("specular")]
@@ -610,9 +774,13 @@ def _as_read(request: BakePlan, on: Device, env: Environment, lit: Lighting, of:
     for e in read:
         engine, levels = request.engines[e], lit.chains[of[e][0]].levels
         target = next((t for t in written if t.engine == engine.name and len(t.levels) == len(levels)), None)
-        found = reader.as_read(request.chains[e], [level.texels for level in levels], [level.error for level in levels],
-                               kept=target.levels if target else None,
-                               format=str(target.stated.get("format", "float32")) if target else "float32")
+        found = reader.as_read(
+            request.chains[e],
+            [level.texels for level in levels],
+            [level.error for level in levels],
+            kept=target.levels if target else None,
+            format=str(target.stated.get("format", "float32")) if target else "float32",
+        )
         rows.append({"for": engine.name, **found.data()})
     return rows
 
@@ -626,21 +794,26 @@ def format_notices(manifest: Mapping[str, Any]) -> list[str]:
     found = []
     for name, entry in manifest["files"].items():
         if entry.get("clipped"):
-            found.append(f"{name}: {entry['clipped']} values over the range of {entry['format']} became its largest; "
-                         "--sun extract or a lower --exposure keeps them")
+            found.append(
+                f"{name}: {entry['clipped']} values over the range of {entry['format']} became its largest; "
+                "--sun extract or a lower --exposure keeps them"
+            )
         if "sh" in str(entry.get("holds", "")).split(", ") and manifest["sh"]["window"] != [1.0, 1.0, 1.0]:
             sh = manifest["sh"]
-            found.append(f"{name}: degrees 1 and 2 of its harmonics are windowed by {sh['window'][1]:.3f} and "
-                         f"{sh['window'][2]:.3f}; their least E/π is {min(sh['minimum']['after']):.3g}, without it "
-                         f"{min(sh['minimum']['before']):.3g}, their RMSE {sh['rmse']:.2g}")
+            found.append(
+                f"{name}: degrees 1 and 2 of its harmonics are windowed by {sh['window'][1]:.3f} and "
+                f"{sh['window'][2]:.3f}; their least E/π is {min(sh['minimum']['after']):.3g}, without it "
+                f"{min(sh['minimum']['before']):.3g}, their RMSE {sh['rmse']:.2g}"
+            )
         worst = max((level.get("format_p99", 0.0) for level in entry.get("levels", ())), default=0.0)
         if worst > FORMAT_LOSS:
             found.append(f"{name}: {entry['format']} costs {worst:.2g} of a texel's value (p99)")
     return found
 
 
-def _would_read(request: BakePlan, env: Environment, device: Device | str | None,
-                on: Device | None) -> tuple[tuple[dict[str, Any], ...], tuple[str, ...]]:
+def _would_read(
+    request: BakePlan, env: Environment, device: Device | str | None, on: Device | None
+) -> tuple[tuple[dict[str, Any], ...], tuple[str, ...]]:
     """Errors after the engine's sampling of the planned chain and of others, and notices; empty without a device."""
     try:
         on = on or choose_device(device if isinstance(device, str) else None)
@@ -653,21 +826,33 @@ def _would_read(request: BakePlan, env: Environment, device: Device | str | None
     for engine, recipe in zip(request.engines, request.chains, strict=True):
         if engine.needs("specular") and recipe not in done:
             done.append(recipe)
-            rows += [{"for": engine.name, **read.data()}
-                     for read in compared(on, env, recipe, alone=engine.whole or engine.levels is not None)]
+            rows += [
+                {"for": engine.name, **read.data()}
+                for read in compared(on, env, recipe, alone=engine.whole or engine.levels is not None)
+            ]
     return tuple(rows), ()
 
 
 def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str, Any]:
     """The recipe as data for the key: everything that changes the bytes, and nothing else."""
-    own = {e.name: {"engine": e.data(), "chain": c.canonical()}
-           for e, c in zip(request.engines, request.chains, strict=True) if e.container == "files" or e.without}
-    return {**request.recipe.canonical(), "for": sorted(e.name for e in request.engines),
-            **({"engines": own} if own else {}), **({"sh": request.window} if own or request.window != "auto" else {}),
-            "rotate": round(math.degrees(rotation), 9),
-            "exposure": exposure, "nonfinite": request.nonfinite, "sun": request.sun, "irradiance": IRRADIANCE_SIZE,
-            **({"as_read": True} if request.as_read else {}),
-            "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE}}
+    own = {
+        e.name: {"engine": e.data(), "chain": c.canonical()}
+        for e, c in zip(request.engines, request.chains, strict=True)
+        if e.container == "files" or e.without
+    }
+    return {
+        **request.recipe.canonical(),
+        "for": sorted(e.name for e in request.engines),
+        **({"engines": own} if own else {}),
+        **({"sh": request.window} if own or request.window != "auto" else {}),
+        "rotate": round(math.degrees(rotation), 9),
+        "exposure": exposure,
+        "nonfinite": request.nonfinite,
+        "sun": request.sun,
+        "irradiance": IRRADIANCE_SIZE,
+        **({"as_read": True} if request.as_read else {}),
+        "dfg": {"size": DFG_SIZE, "masking": "smith", "tolerance": DFG_TOLERANCE},
+    }
 
 
 @dataclass(frozen=True)
@@ -705,13 +890,31 @@ def _key(digest: str, recipe: dict[str, Any]) -> str:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def _manifest(request: BakePlan, name: str, env: Environment, sun: Sun | None, recipe: dict[str, Any], key: str,
-              device: Device, lit: Lighting, of: Sequence[tuple[int, int]], table: Integrated,
-              window: harmonic.Windowed) -> dict[str, Any]:
-    def row(level: Level, kept: float | None = None, ndf: str | None = None,
-            names: Sequence[str] = ()) -> dict[str, Any]:
-        data = {"size": level.texels.shape[-2], "roughness": level.roughness, "method": level.method,
-                "pairs": level.pairs, "error": level.error, "worst": level.worst, "rmse": level.rmse}
+def _manifest(
+    request: BakePlan,
+    name: str,
+    env: Environment,
+    sun: Sun | None,
+    recipe: dict[str, Any],
+    key: str,
+    device: Device,
+    lit: Lighting,
+    of: Sequence[tuple[int, int]],
+    table: Integrated,
+    window: harmonic.Windowed,
+) -> dict[str, Any]:
+    def row(
+        level: Level, kept: float | None = None, ndf: str | None = None, names: Sequence[str] = ()
+    ) -> dict[str, Any]:
+        data = {
+            "size": level.texels.shape[-2],
+            "roughness": level.roughness,
+            "method": level.method,
+            "pairs": level.pairs,
+            "error": level.error,
+            "worst": level.worst,
+            "rmse": level.rmse,
+        }
         data |= {"for": sorted(names)} if names else {}
         data |= {"ndf": ndf} if ndf not in (None, request.recipe.ndf.model.name) else {}
         return data if kept is None else {**data, "energy_kept": 1 + kept}
@@ -727,20 +930,37 @@ def _manifest(request: BakePlan, name: str, env: Environment, sun: Sun | None, r
         "key": key,
         "recipe": recipe,
         "device": device.identity(),
-        "source": {"sha256": env.digest, "layout": env.layout, "statistics": env.statistics,
-                   "notices": list(env.notices)},
+        "source": {
+            "sha256": env.digest,
+            "layout": env.layout,
+            "statistics": env.statistics,
+            "notices": list(env.notices),
+        },
         **({} if sun is None else {"sun": sun.data()}),
-        **({"engines": {e.name: {"facts": e.facts, "proven": e.proven, "steps": list(e.steps)}
-                        for e in request.engines if e.container == "files"}}
-           if any(e.container == "files" for e in request.engines) else {}),
+        **(
+            {
+                "engines": {
+                    e.name: {"facts": e.facts, "proven": e.proven, "steps": list(e.steps)}
+                    for e in request.engines
+                    if e.container == "files"
+                }
+            }
+            if any(e.container == "files" for e in request.engines)
+            else {}
+        ),
         "levels": rows("levels"),
         "latlong_levels": rows("latlongs"),
         **({"octahedral_levels": rows("octahedral")} if any(e.octahedral for e in request.engines) else {}),
         "coverage_levels": [*rows("coverage"), *rows("latlong_coverage"), *rows("octahedral_coverage")],
         "irradiance": row(lit.irradiance),
-        "sh": {"coefficients": lit.sh.tolist(), "error": lit.sh_error, "mode": window.mode,
-               "window": window.window.tolist(), "minimum": {"before": window.before.tolist(),
-                                                             "after": window.after.tolist()},
-               "rmse": off, "worst": most},
+        "sh": {
+            "coefficients": lit.sh.tolist(),
+            "error": lit.sh_error,
+            "mode": window.mode,
+            "window": window.window.tolist(),
+            "minimum": {"before": window.before.tolist(), "after": window.after.tolist()},
+            "rmse": off,
+            "worst": most,
+        },
         "dfg": {"size": DFG_SIZE, "error": table.error, "rule": table.rule},
     }

@@ -1,4 +1,5 @@
 """The files of a bake: for each engine what is written where, and what its format costs."""
+
 from __future__ import annotations
 
 import json
@@ -112,8 +113,10 @@ def targets(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Targe
     """The files of an engine under `folder`/ENGINE, planned. Raises UsageError for what cannot be made."""
     if engine.container != "files":
         return CONTAINERS[engine.container].planned(engine, chain, folder, stem)
-    found = [Target(_path(engine, folder, stem, file), engine.name,
-                    WRITERS[file.holds].planned_size(engine, chain, file)) for file in engine.file]
+    found = [
+        Target(_path(engine, folder, stem, file), engine.name, WRITERS[file.holds].planned_size(engine, chain, file))
+        for file in engine.file
+    ]
     return [*found, *_snippets(engine, chain, folder, stem)]
 
 
@@ -132,14 +135,25 @@ def _path(engine: Engine, folder: Path, stem: str, file: File) -> Path:
 def _snippets(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Encoded]:
     if not engine.holding("specular"):
         return []
-    return [_bytes(engine, folder / engine.name / f"{stem}.{language}",
-                   snippet(engine, language, levels=len(chain.levels), width=chain.size, stem=stem).encode(),
-                   {"holds": "shader snippet"}) for language in LANGUAGES]
+    return [
+        _bytes(
+            engine,
+            folder / engine.name / f"{stem}.{language}",
+            snippet(engine, language, levels=len(chain.levels), width=chain.size, stem=stem).encode(),
+            {"holds": "shader snippet"},
+        )
+        for language in LANGUAGES
+    ]
 
 
 def _bytes(engine: Engine, path: Path, data: bytes, stated: Mapping[str, Any]) -> Encoded:
-    return Encoded(path, engine.name, len(data),
-                   lambda t: write_atomic(path, lambda temporary: temporary.write_bytes(data), t), stated)
+    return Encoded(
+        path,
+        engine.name,
+        len(data),
+        lambda t: write_atomic(path, lambda temporary: temporary.write_bytes(data), t),
+        stated,
+    )
 
 
 # ---------------------------------------------------------------------------------------------- what formats cost
@@ -154,8 +168,12 @@ def _format_loss(kept: np.ndarray, true: np.ndarray, mean: float) -> dict[str, f
 def _level_stated(level: Level, kept: np.ndarray, true: np.ndarray) -> dict[str, Any]:
     """What the manifest says of a level: `true` as computed, `kept` as the format holds it."""
     mean = float(true.astype(np.float64).mean())
-    return {"size": int(true.shape[-2]), "roughness": level.roughness, "error": level.error,
-            **_format_loss(kept[..., :3], true, mean)}
+    return {
+        "size": int(true.shape[-2]),
+        "roughness": level.roughness,
+        "error": level.error,
+        **_format_loss(kept[..., :3], true, mean),
+    }
 
 
 def _clipped(clipped: Sequence[int]) -> dict[str, Any]:
@@ -164,32 +182,53 @@ def _clipped(clipped: Sequence[int]) -> dict[str, Any]:
 
 def _keys(engine: Engine, made: Made, errors: Sequence[float]) -> dict[str, bytes]:
     """The metadata of a container; the manifest states the rest."""
-    return {"KTXwriter": text_value(f"whitefurnace {VERSION}"), "whitefurnace:engine": text_value(engine.name),
-            "whitefurnace:key": text_value(made.provenance["key"]),
-            "whitefurnace:error": text_value(" ".join(f"{e:.2e}" for e in errors))}
+    return {
+        "KTXwriter": text_value(f"whitefurnace {VERSION}"),
+        "whitefurnace:engine": text_value(engine.name),
+        "whitefurnace:key": text_value(made.provenance["key"]),
+        "whitefurnace:error": text_value(" ".join(f"{e:.2e}" for e in errors)),
+    }
 
 
 # ---------------------------------------------------------------------------------------------- cubes
 
 
-def _texture(engine: Engine, path: Path, file: File, levels: Sequence[Level], made: Made,
-             keys: Mapping[str, bytes], coverage: Sequence[Level] = ()) -> Encoded:
+def _texture(
+    engine: Engine,
+    path: Path,
+    file: File,
+    levels: Sequence[Level],
+    made: Made,
+    keys: Mapping[str, bytes],
+    coverage: Sequence[Level] = (),
+) -> Encoded:
     """Cube levels in a pixel format, turned to the engine's axes, with what the format costs each."""
     turned = [turned_cube(level.texels, engine.matrix) for level in levels]
     held: list[np.ndarray] = turned
     if coverage and file.stored in ("rgba16f", "rgba32f"):
-        held = [np.concatenate([texels, turned_cube(alpha.texels, engine.matrix)[..., :1]], -1)
-                for texels, alpha in zip(turned, coverage, strict=True)]
+        held = [
+            np.concatenate([texels, turned_cube(alpha.texels, engine.matrix)[..., :1]], -1)
+            for texels, alpha in zip(turned, coverage, strict=True)
+        ]
     if path.suffix == ".dds":
         keys = {}  # has no place for them
     packed = encode(file.stored, held, cube=True, key_values=keys)
     back = [decode(packed.texture, k) for k in range(len(levels))]
-    stated = {"holds": file.holds, "format": file.stored, **_clipped(packed.clipped),
-              "levels": [_level_stated(*one) for one in zip(levels, back, turned, strict=True)]}
+    stated = {
+        "holds": file.holds,
+        "format": file.stored,
+        **_clipped(packed.clipped),
+        "levels": [_level_stated(*one) for one in zip(levels, back, turned, strict=True)],
+    }
     inverse = np.array(engine.matrix).T
-    return Encoded(path, engine.name, _size(packed.texture),
-                   lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t), stated,
-                   tuple(turned_cube(texels[..., :3], inverse) for texels in back))
+    return Encoded(
+        path,
+        engine.name,
+        _size(packed.texture),
+        lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t),
+        stated,
+        tuple(turned_cube(texels[..., :3], inverse) for texels in back),
+    )
 
 
 def _size(texture: Texture) -> int:
@@ -213,8 +252,10 @@ def _specular_size(engine: Engine, chain: Chain, file: File) -> int:
     if file.layout == "cube":
         return _cube_bytes(sizes, file)
     if file.border > sizes[-1]:
-        raise UsageError(f"{engine.name}: a border of {file.border} texels does not go around the last level's "
-                         f"{sizes[-1]}²; give a lower border or a larger --min-size")
+        raise UsageError(
+            f"{engine.name}: a border of {file.border} texels does not go around the last level's "
+            f"{sizes[-1]}²; give a lower border or a larger --min-size"
+        )
     return _cube_bytes(sizes, file) // 6
 
 
@@ -267,20 +308,35 @@ def _octahedral(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     maps = [level.texels for level in levels]
     stated: dict[str, Any] = {"holds": file.holds, "format": file.stored, "layout": "octahedral", "border": file.border}
     if coverage and file.stored in ("rgba16f", "rgba32f", "float32"):
-        maps = [np.concatenate([texels, alpha.texels[..., :1]], -1)
-                for texels, alpha in zip(maps, coverage, strict=True)]
+        maps = [
+            np.concatenate([texels, alpha.texels[..., :1]], -1) for texels, alpha in zip(maps, coverage, strict=True)
+        ]
     if file.suffix == ".exr":
         image, places = to_atlas(maps, file.border)
-        stated["levels"] = [{"size": p.side, "roughness": level.roughness, "error": level.error, "row": p.row,
-                             "column": p.column} for level, p in zip(levels, places, strict=True)]
-        return Encoded(path, engine.name, image.nbytes, lambda t: write_exr(
-            path, image, channel_names=tuple("RGBA"[:image.shape[-1]]), attributes=_attributes(made), into=t), stated)
+        stated["levels"] = [
+            {"size": p.side, "roughness": level.roughness, "error": level.error, "row": p.row, "column": p.column}
+            for level, p in zip(levels, places, strict=True)
+        ]
+        return Encoded(
+            path,
+            engine.name,
+            image.nbytes,
+            lambda t: write_exr(
+                path, image, channel_names=tuple("RGBA"[: image.shape[-1]]), attributes=_attributes(made), into=t
+            ),
+            stated,
+        )
     keys = {} if path.suffix == ".dds" else _keys(engine, made, [level.error for level in levels])
     packed = encode(file.stored, maps, key_values=keys)
     stated |= _clipped(packed.clipped)
     stated["levels"] = [_level_stated(level, decode(packed.texture, k), level.texels) for k, level in enumerate(levels)]
-    return Encoded(path, engine.name, _size(packed.texture),
-                   lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t), stated)
+    return Encoded(
+        path,
+        engine.name,
+        _size(packed.texture),
+        lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t),
+        stated,
+    )
 
 
 def _attributes(made: Made, more: Mapping[str, str | float] | None = None) -> dict[str, str | float]:
@@ -313,8 +369,10 @@ def _sh_file(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
         text = json.dumps(dict(zip(names, rows.tolist(), strict=True)), indent=2) + "\n"
     else:
         scale = "irradiance, pre-scaled base" if engine.sh == "filament" else engine.sh
-        text = "".join(f"({r:18.15f}, {g:18.15f}, {b:18.15f}); // {name}, {scale}\n"
-                       for name, (r, g, b) in zip(names, rows, strict=True))
+        text = "".join(
+            f"({r:18.15f}, {g:18.15f}, {b:18.15f}); // {name}, {scale}\n"
+            for name, (r, g, b) in zip(names, rows, strict=True)
+        )
     return _bytes(engine, path, text.encode(), {"holds": "sh", "scale": engine.sh, "error": made.lit.sh_error})
 
 
@@ -325,31 +383,56 @@ def _rgbd(levels: Sequence[Level], engine: Engine) -> tuple[list[np.ndarray], li
     """Levels turned to the engine's axes, what RGBD makes of them, and how many values it clips."""
     turned = [turned_cube(level.texels, engine.matrix) for level in levels]
     packed = [pack("rgbd", texels) for texels in turned]
-    return turned, [unpack("rgbd", p.data, t.shape[:-1]) for p, t in zip(packed, turned, strict=True)], sum(
-        p.clipped for p in packed)
+    return (
+        turned,
+        [unpack("rgbd", p.data, t.shape[:-1]) for p, t in zip(packed, turned, strict=True)],
+        sum(p.clipped for p in packed),
+    )
 
 
-def _whole(engine: Engine, path: Path, levels: Sequence[Level], made: Made,
-           write: Callable[[Sequence[np.ndarray], Transaction], object]) -> Encoded:
+def _whole(
+    engine: Engine,
+    path: Path,
+    levels: Sequence[Level],
+    made: Made,
+    write: Callable[[Sequence[np.ndarray], Transaction], object],
+) -> Encoded:
     """A container of RGBD faces with harmonics."""
     turned, back, clipped = _rgbd(levels, engine)
-    stated = {"holds": "specular, sh", "format": "rgbd", **_clipped([clipped]), "scale": engine.sh,
-              "sh_error": made.lit.sh_error,
-              "levels": [_level_stated(*one) for one in zip(levels, back, turned, strict=True)]}
+    stated = {
+        "holds": "specular, sh",
+        "format": "rgbd",
+        **_clipped([clipped]),
+        "scale": engine.sh,
+        "sh_error": made.lit.sh_error,
+        "levels": [_level_stated(*one) for one in zip(levels, back, turned, strict=True)],
+    }
     inverse = np.array(engine.matrix).T
-    return Encoded(path, engine.name, sum(6 * 4 * t.shape[1] ** 2 for t in turned), lambda t: write(turned, t), stated,
-                   tuple(turned_cube(texels, inverse) for texels in back))
+    return Encoded(
+        path,
+        engine.name,
+        sum(6 * 4 * t.shape[1] ** 2 for t in turned),
+        lambda t: write(turned, t),
+        stated,
+        tuple(turned_cube(texels, inverse) for texels in back),
+    )
 
 
 def _env(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> Encoded:
     polynomials = _sh(engine, made) if engine.sh else None
-    return _whole(engine, path, levels, made,
-                  lambda turned, t: write_env(path, EnvMap(tuple(turned), polynomials), into=t))
+    return _whole(
+        engine, path, levels, made, lambda turned, t: write_env(path, EnvMap(tuple(turned), polynomials), into=t)
+    )
 
 
 def _gltf(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> Encoded:
-    return _whole(engine, path, levels, made,
-                  lambda turned, t: write_gltf_lights(path, GltfLight(tuple(turned), _sh(engine, made)), into=t))
+    return _whole(
+        engine,
+        path,
+        levels,
+        made,
+        lambda turned, t: write_gltf_lights(path, GltfLight(tuple(turned), _sh(engine, made)), into=t),
+    )
 
 
 # ---------------------------------------------------------------------------------------------- lat-longs and tables
@@ -367,8 +450,15 @@ def _environment(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
         alpha = made.chain.latlong_coverage[0].texels[..., :1] if made.chain.latlong_coverage else None
         pixels = level.texels if alpha is None else np.concatenate([level.texels, alpha], -1)
         stated |= {"levels": [{"size": columns, "roughness": 0.0, "error": level.error}]}
-        return Encoded(path, engine.name, 12 * rows * columns, lambda t: write_exr(
-            path, pixels, channel_names=tuple("RGBA"[:pixels.shape[-1]]), attributes=_attributes(made), into=t), stated)
+        return Encoded(
+            path,
+            engine.name,
+            12 * rows * columns,
+            lambda t: write_exr(
+                path, pixels, channel_names=tuple("RGBA"[: pixels.shape[-1]]), attributes=_attributes(made), into=t
+            ),
+            stated,
+        )
     stated |= {"levels": [_level_stated(level, unpack_hdr(pack_hdr(level.texels).data), level.texels)]}
     return Encoded(path, engine.name, 4 * rows * columns, lambda t: write_hdr(path, level.texels, into=t), stated)
 
@@ -381,11 +471,22 @@ def _dfg(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     n, channels = engine.dfg.size, 3 if engine.dfg.charlie else 2
     assert made.split is not None
     values = made.split.values
-    stated = {"holds": "dfg", "format": file.stored, "size": n, "error": made.split.error, "rule": made.split.rule,
-              **({"charlie_error": made.split.charlie_error} if engine.dfg.charlie else {})}
+    stated = {
+        "holds": "dfg",
+        "format": file.stored,
+        "size": n,
+        "error": made.split.error,
+        "rule": made.split.rule,
+        **({"charlie_error": made.split.charlie_error} if engine.dfg.charlie else {}),
+    }
     if file.suffix == ".exr":
-        return Encoded(path, engine.name, values.nbytes, lambda t: write_exr(
-            path, values, channel_names=tuple("RGB"[:channels]), into=t), stated)
+        return Encoded(
+            path,
+            engine.name,
+            values.nbytes,
+            lambda t: write_exr(path, values, channel_names=tuple("RGB"[:channels]), into=t),
+            stated,
+        )
     wide = values
     if file.stored != "rg16f" and channels == 2:
         wide = np.concatenate([values, np.zeros_like(values[..., :1])], -1)
@@ -397,8 +498,13 @@ def _dfg(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
     keys = _keys(engine, made, [made.split.error])
     packed = encode(file.stored, [wide], key_values={} if file.suffix == ".dds" else keys)
     stated["format_worst"] = float(np.abs(decode(packed.texture, 0)[..., :channels] - values).max())
-    return Encoded(path, engine.name, _size(packed.texture),
-                   lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t), stated)
+    return Encoded(
+        path,
+        engine.name,
+        _size(packed.texture),
+        lambda t: write_texture(path, packed.texture, zstd=file.zstd, into=t),
+        stated,
+    )
 
 
 WRITERS = {
@@ -417,8 +523,9 @@ WRITERS = {
 
 
 def _npz_planned(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Target]:
-    count = 3 * sum(6 * s * s for s, _ in chain.levels) + sum(n for holds, n in (
-        ("irradiance", 3 * 6 * IRRADIANCE_SIZE**2), ("dfg", 2 * DFG_SIZE**2)) if engine.needs(holds))
+    count = 3 * sum(6 * s * s for s, _ in chain.levels) + sum(
+        n for holds, n in (("irradiance", 3 * 6 * IRRADIANCE_SIZE**2), ("dfg", 2 * DFG_SIZE**2)) if engine.needs(holds)
+    )
     return [Target(folder / engine.name / f"{stem}.npz", engine.name, 4 * count)]
 
 
@@ -428,13 +535,20 @@ def _npz(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made) -> l
     arrays: dict[str, np.ndarray] = {f"specular_{k}": level.texels for k, level in enumerate(levels, chain.first)}
     for statistic in ("roughness", "error", "worst", "rmse"):
         arrays[statistic] = np.full(len(chain.all_levels), np.nan)  # of levels that are not made
-        arrays[statistic][chain.first:chain.first + len(levels)] = [getattr(level, statistic) for level in levels]
+        arrays[statistic][chain.first : chain.first + len(levels)] = [getattr(level, statistic) for level in levels]
     arrays["roughness"] = np.array([r for _, r in chain.all_levels])
     rest = {"irradiance": lit.irradiance.texels, "sh": lit.sh, "dfg": made.table.values}
     arrays |= {holds: array for holds, array in rest.items() if engine.needs(holds)}
     arrays |= {f"coverage_{k}": level.texels[..., 0] for k, level in enumerate(made.chain.coverage, chain.first)}
-    return [Encoded(target.path, engine.name, target.nbytes, lambda t: write_npz(target.path, arrays, into=t),
-                    levels=tuple(level.texels for level in levels))]
+    return [
+        Encoded(
+            target.path,
+            engine.name,
+            target.nbytes,
+            lambda t: write_npz(target.path, arrays, into=t),
+            levels=tuple(level.texels for level in levels),
+        )
+    ]
 
 
 @dataclass(frozen=True)
@@ -447,8 +561,9 @@ class _Image:
 
     def target(self, engine: Engine, folder: Path, stem: str) -> Target:
         rows, columns = self.shape
-        return Target(folder / engine.name / f"{stem}_{self.ending}.exr", engine.name,
-                      4 * rows * columns * len(self.channels))
+        return Target(
+            folder / engine.name / f"{stem}_{self.ending}.exr", engine.name, 4 * rows * columns * len(self.channels)
+        )
 
 
 def _images(engine: Engine, chain: Chain) -> dict[str, _Image]:
@@ -477,20 +592,40 @@ def _exr(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made) -> l
         pixels, names = texels.reshape(*image.shape, -1), image.channels
         if alpha is not None:
             pixels, names = np.concatenate([pixels, alpha.reshape(*image.shape, 1)], -1), "RGBA"
-        found.append(Encoded(target.path, engine.name, target.nbytes, lambda t: write_exr(
-            target.path, pixels, channel_names=tuple(names), attributes=_attributes(made, more), into=t)))
+        found.append(
+            Encoded(
+                target.path,
+                engine.name,
+                target.nbytes,
+                lambda t: write_exr(
+                    target.path, pixels, channel_names=tuple(names), attributes=_attributes(made, more), into=t
+                ),
+            )
+        )
 
     for k in range(len(chain.levels)):
         for ending, level, coverage in (
             (f"specular_{k + chain.first}", made.chain.levels[k], made.chain.coverage),
             (f"specular_{k + chain.first}_latlong", made.chain.latlongs[k], made.chain.latlong_coverage),
         ):
-            add(ending, level.texels, {
-                "roughness": level.roughness, "error": level.error, "worst": level.worst, "rmse": level.rmse,
-                "method": level.method}, coverage[k].texels[..., 0] if coverage else None)
+            add(
+                ending,
+                level.texels,
+                {
+                    "roughness": level.roughness,
+                    "error": level.error,
+                    "worst": level.worst,
+                    "rmse": level.rmse,
+                    "method": level.method,
+                },
+                coverage[k].texels[..., 0] if coverage else None,
+            )
     if "irradiance" in images:
-        add("irradiance", made.lit.irradiance.texels,
-            {"error": made.lit.irradiance.error, "sh": json.dumps(made.lit.sh.tolist())})
+        add(
+            "irradiance",
+            made.lit.irradiance.texels,
+            {"error": made.lit.irradiance.error, "sh": json.dumps(made.lit.sh.tolist())},
+        )
     if "dfg" in images:
         add("dfg", made.table.values, {"error": made.table.error, "rule": made.table.rule})
     return found

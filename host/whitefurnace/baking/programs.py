@@ -1,4 +1,5 @@
 """The kernel programs that a bake compiles to: the models of its recipe and nothing else, each with its text."""
+
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
@@ -36,12 +37,19 @@ class Program:
     def data(self) -> dict[str, Any]:
         """The program as data for JSON."""
         text = self.source.text
-        return {"program": self.name, "when": self.when or None, "digest": self.source.digest, "bytes": self.nbytes,
-                "lines": text.count("\n"), "text": text}
+        return {
+            "program": self.name,
+            "when": self.when or None,
+            "digest": self.source.digest,
+            "bytes": self.nbytes,
+            "lines": text.count("\n"),
+            "text": text,
+        }
 
 
-def programs(chains: Sequence[Chain], kind: str, texel: float, *, demo: bool = False,
-             charlie: bool = False) -> tuple[Program, ...]:
+def programs(
+    chains: Sequence[Chain], kind: str, texel: float, *, demo: bool = False, charlie: bool = False
+) -> tuple[Program, ...]:
     """The programs that a bake builds, the table of split sums included; equal texts once.
 
     chains: of the engines. kind: "latlong" or "cube". texel: width of a source texel in radians. demo: whether the
@@ -70,15 +78,22 @@ def _programs(chains: Sequence[Chain], kind: str, texel: float, demo: bool, char
         entry = chain.ndf.model
         if not any(level.roughness > 0 for level in plan_chain(chain, texel)):
             continue
-        yield Program(f"certificates of {entry.name}", source.convolution(entry),
-                      "" if chain.certify else "where levels are certified")
+        yield Program(
+            f"certificates of {entry.name}",
+            source.convolution(entry),
+            "" if chain.certify else "where levels are certified",
+        )
         yield Program(f"bright texels under {entry.name}", source.apart(entry), "where texels stand out")
-        yield Program(f"texels near a narrow lobe of {entry.name}", source.near_texels(kind, entry),
-                      "where a lobe is narrower than a texel")
+        yield Program(
+            f"texels near a narrow lobe of {entry.name}",
+            source.near_texels(kind, entry),
+            "where a lobe is narrower than a texel",
+        )
         if entry.text is not None:
             yield from _derived(entry)
-    yield Program("certificates of irradiance", source.convolution(None),
-                  "" if chains[0].certify else "where it is certified")
+    yield Program(
+        "certificates of irradiance", source.convolution(None), "" if chains[0].certify else "where it is certified"
+    )
     yield Program("bright texels under the cosine", source.apart(None), "where texels stand out")
     yield from _integrated("dfg", chains[0].ndf.model)
     if charlie:
@@ -103,8 +118,11 @@ def _integrated(name: str, ndf: Model) -> Iterator[Program]:
         yield Program(f"{name} of {ndf.name}", source.closed(own, slots))
         return
     tabled = "NDF_AREA" not in ndf.provides
-    yield Program(f"{name} of {ndf.name}", source.integration(entry, slots, LEAST_TERMS if tabled else 0),
-                  "with as many AREA_TERMS as its table takes" if tabled else "")
+    yield Program(
+        f"{name} of {ndf.name}",
+        source.integration(entry, slots, LEAST_TERMS if tabled else 0),
+        "with as many AREA_TERMS as its table takes" if tabled else "",
+    )
     if tabled:
         yield Program(f"Smith's area of {ndf.name}", source.area(ndf))
         yield Program(f"width of {ndf.name}", source.evaluation("NDF_WIDTH", {"ndf": ndf}))

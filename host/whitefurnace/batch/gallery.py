@@ -2,6 +2,7 @@
 
 The page opens from disk, loads nothing from a network, and has the same bytes for the same results.
 """
+
 from __future__ import annotations
 
 import base64
@@ -41,8 +42,16 @@ MOST_LISTED = 20
 MOST_TEXT = 600
 """Largest number of characters of a name or a notice on a page."""
 
-BAKES = (("Environment", "text"), ("Largest error", ""), ("As stored", ""), ("Time", ""), ("Size", ""),
-         ("Sun share", ""), ("Energy kept", ""), ("Notices", ""))
+BAKES = (
+    ("Environment", "text"),
+    ("Largest error", ""),
+    ("As stored", ""),
+    ("Time", ""),
+    ("Size", ""),
+    ("Sun share", ""),
+    ("Energy kept", ""),
+    ("Notices", ""),
+)
 ABOUT = {
     "Environment": "name, source and levels",
     "Largest error": "the largest error that a level or the irradiance states; below it the worst texel seen",
@@ -57,8 +66,9 @@ TABLES = (("Table", "text"), ("Error", ""), ("Time", ""), ("Size", ""), ("Notice
 FAILED = (("Item", "text"), ("Reason", "text"), ("Exit code", ""))
 
 
-def write_gallery(folder: str | os.PathLike[str], results: Iterable[Result], *, title: str = "Bakes",
-                  force: bool = False) -> Path:
+def write_gallery(
+    folder: str | os.PathLike[str], results: Iterable[Result], *, title: str = "Bakes", force: bool = False
+) -> Path:
     """Write the page of `results`, FOLDER/index.html, with pictures in FOLDER/strips; return its path.
 
     Raises FileError for a file that cannot be read or written, and, without `force`, for an index.html that this tool
@@ -80,8 +90,16 @@ def found_in(output: str | os.PathLike[str]) -> Iterator[Result]:
         name, place = path.name.removesuffix(".json"), path.relative_to(output).as_posix()
         if stated.get("name") == name:
             kind = "bake" if isinstance(stated.get("levels"), list) else "lut"
-            yield Result(0, kind, place, name, "skipped", str(path.parent if kind == "bake" else path.with_name(name)),
-                         str(path), nbytes=_size_of(stated))
+            yield Result(
+                0,
+                kind,
+                place,
+                name,
+                "skipped",
+                str(path.parent if kind == "bake" else path.with_name(name)),
+                str(path),
+                nbytes=_size_of(stated),
+            )
 
 
 class Gallery:
@@ -165,8 +183,10 @@ class Gallery:
     # --------------------------------------------------------------------------------------------- rows
 
     def _failed(self, result: Result) -> str:
-        return (f'<tr><th scope="row"><bdi>{_text(result.place)}</bdi></th><td><bdi>{_text(result.message)}</bdi></td>'
-                f'<td data-v="{result.exit_code}">{result.exit_code}</td></tr>\n')
+        return (
+            f'<tr><th scope="row"><bdi>{_text(result.place)}</bdi></th><td><bdi>{_text(result.message)}</bdi></td>'
+            f'<td data-v="{result.exit_code}">{result.exit_code}</td></tr>\n'
+        )
 
     def _row(self, result: Result) -> str:
         stated = read_manifest(result.manifest) or {}
@@ -176,8 +196,10 @@ class Gallery:
         seconds = sum(result.seconds.values()) if result.state == "done" else None
         if seconds is not None:
             self._seconds += seconds
-        ends = _cell(seconds, "up to date" if seconds is None else f"{seconds:.2f} s"), \
-            _cell(result.nbytes, bytes_text(result.nbytes))
+        ends = (
+            _cell(seconds, "up to date" if seconds is None else f"{seconds:.2f} s"),
+            _cell(result.nbytes, bytes_text(result.nbytes)),
+        )
         link = _link(result.manifest, self.folder)
         name = f'<a href="{link}"><bdi>{_text(result.name)}</bdi></a>' if link else f"<bdi>{_text(result.name)}</bdi>"
         if result.kind == "lut":
@@ -191,15 +213,22 @@ class Gallery:
         worst = max((e for row in rows if (e := _finite_number(row.get("worst"))) is not None), default=None)
         self._larger(error, result.name)
         stored = _stored(stated)
-        first = (f'<span class="name">{name}</span><span class="small cut"><bdi>{_text(result.place)}</bdi></span>'
-                 f'<span class="small">{_text(_about(stated))}</span>{self._thumbnail(result, stated)}')
+        first = (
+            f'<span class="name">{name}</span><span class="small cut"><bdi>{_text(result.place)}</bdi></span>'
+            f'<span class="small">{_text(_about(stated))}</span>{self._thumbnail(result, stated)}'
+        )
         items = "".join(f"<li><b>{_text(engine)}</b> {_figure(e)}</li>" for engine, e in stored.items())
         beside = "" if worst is None else f'<span class="small">worst {_figure(worst)}</span>'
-        cells = "".join((
-            _cell(error, _figure(error) + beside),
-            _cell(max(stored.values(), default=None), f"<ul>{items}</ul>" if items else "–"), *ends,
-            _share(_finite_number(_dict(_dict(stated.get("source")).get("statistics")).get("brightest_share"))),
-            _energy(rows), _listed(notices)))
+        cells = "".join(
+            (
+                _cell(error, _figure(error) + beside),
+                _cell(max(stored.values(), default=None), f"<ul>{items}</ul>" if items else "–"),
+                *ends,
+                _share(_finite_number(_dict(_dict(stated.get("source")).get("statistics")).get("brightest_share"))),
+                _energy(rows),
+                _listed(notices),
+            )
+        )
         return f'<tr><th scope="row">{first}</th>{cells}</tr>\n'
 
     def _thumbnail(self, result: Result, stated: Mapping[str, Any]) -> str:
@@ -220,8 +249,10 @@ class Gallery:
         width, height = _dimensions(path)
         spheres = width // CELL - 3
         several = f"metal spheres of its {spheres} levels" if spheres > 1 else "a metal sphere of it"
-        return (f'<img class="strip" src="{THUMBNAILS}/{name}" width="{width}" height="{height}" loading="lazy" '
-                f'decoding="async" alt="Level 0 as a panorama, {several}, a matte sphere">')
+        return (
+            f'<img class="strip" src="{THUMBNAILS}/{name}" width="{width}" height="{height}" loading="lazy" '
+            f'decoding="async" alt="Level 0 as a panorama, {several}, a matte sphere">'
+        )
 
     def _count(self, stated: Mapping[str, Any]) -> None:
         device = _dict(stated.get("device"))
@@ -239,23 +270,38 @@ class Gallery:
         """Return the HTML before and after the tables."""
         count = sum(self._states.values())
         tiles = [("items", f"{total}", "")]
-        tiles += [(what, f"{self._states[state]}", "failed" if state == "failed" else "")
-                  for state, what in (("done", "baked now"), ("skipped", "up to date"), ("failed", "failed"))
-                  if self._states[state]]
+        tiles += [
+            (what, f"{self._states[state]}", "failed" if state == "failed" else "")
+            for state, what in (("done", "baked now"), ("skipped", "up to date"), ("failed", "failed"))
+            if self._states[state]
+        ]
         tiles += [("not begun", f"{total - count}", "failed")] if total > count else []
         tiles += [("size", bytes_text(self._nbytes), "")]
         tiles += [("time of items", _time(self._seconds), "")] if self._states["done"] else []
         if self._error is not None:
-            tiles.append(("largest error", f'{_figure(self._error[0])} <span class="small"><bdi>'
-                                           f"{_text(self._error[1])}</bdi></span>", ""))
-        parts = [f"<div{_attribute('class', kind)}><dt>{what}</dt><dd>{value}</dd></div>"
-                 for what, value, kind in tiles]
-        parts += [f'<div><dt>{what}</dt><dd class="text">{"<br>".join(map(_text, sorted(values)))}</dd></div>'
-                  for what, values in (("device", self._devices), ("whitefurnace", self._versions)) if values]
+            tiles.append(
+                (
+                    "largest error",
+                    f'{_figure(self._error[0])} <span class="small"><bdi>{_text(self._error[1])}</bdi></span>',
+                    "",
+                )
+            )
+        parts = [
+            f"<div{_attribute('class', kind)}><dt>{what}</dt><dd>{value}</dd></div>" for what, value, kind in tiles
+        ]
+        parts += [
+            f'<div><dt>{what}</dt><dd class="text">{"<br>".join(map(_text, sorted(values)))}</dd></div>'
+            for what, values in (("device", self._devices), ("whitefurnace", self._versions))
+            if values
+        ]
         page = importlib.resources.files("whitefurnace.batch").joinpath("gallery.html").read_text("utf-8")
         title = _text(self.title)
-        for mark, text in (("policy", _policy(page)), ("title", f"{title} · whitefurnace"),
-                           ("heading", f"<bdi>{title}</bdi>"), ("summary", "\n".join(parts))):
+        for mark, text in (
+            ("policy", _policy(page)),
+            ("title", f"{title} · whitefurnace"),
+            ("heading", f"<bdi>{title}</bdi>"),
+            ("summary", "\n".join(parts)),
+        ):
             page = page.replace(f"{{{{{mark}}}}}", text, 1)
         begin, _, end = page.partition("{{body}}\n")
         return begin, end
@@ -290,27 +336,38 @@ def _policy(page: str) -> str:
 
     It allows the page's own style and script, by their digests, and images in its folder.
     """
+
     def digest(tag: str) -> str:
         body = page.partition(f"<{tag}>")[2].partition(f"</{tag}>")[0]
         return f"'sha256-{base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()}'"
 
-    return (f"default-src 'none'; img-src 'self' file:; style-src {digest('style')}; script-src {digest('script')}; "
-            "base-uri 'none'; form-action 'none'")
+    return (
+        f"default-src 'none'; img-src 'self' file:; style-src {digest('style')}; script-src {digest('script')}; "
+        "base-uri 'none'; form-action 'none'"
+    )
 
 
 def _table_head(kind: str, columns: Sequence[tuple[str, str]], count: int) -> str:
     title = {"failed": f"{count} failed", "bake": "Environments", "lut": "Tables"}[kind]
     wrong = _attribute("class", "failed" if kind == "failed" else "")
-    heads = "".join(f'<th scope="col"{_attribute("data-by", by)}><button type="button"'
-                    f'{_attribute("title", ABOUT[name] if kind == "bake" else "")}>{name}</button></th>'
-                    for name, by in columns)
+    heads = "".join(
+        f'<th scope="col"{_attribute("data-by", by)}><button type="button"'
+        f"{_attribute('title', ABOUT[name] if kind == 'bake' else '')}>{name}</button></th>"
+        for name, by in columns
+    )
     widths = "".join(f'<col class="w{k}">' for k in range(1, 1 + len(columns)))
-    find = ('<p class="find" hidden><input type="search" aria-label="Show environments whose name, source or engine '
-            'holds this" placeholder="Find…"></p>\n' if kind == "bake" and count > FEW else "")
+    find = (
+        '<p class="find" hidden><input type="search" aria-label="Show environments whose name, source or engine '
+        'holds this" placeholder="Find…"></p>\n'
+        if kind == "bake" and count > FEW
+        else ""
+    )
     names = f"{kind} many" if kind == "bake" and count > MANY else kind
-    return (f'<section>\n<h2 id="of-{kind}"{wrong}>{title}</h2>\n{find}'
-            f'<table class="{names}" aria-labelledby="of-{kind}">\n<colgroup>{widths}</colgroup>\n'
-            f"<thead><tr>{heads}</tr></thead>\n<tbody>\n")
+    return (
+        f'<section>\n<h2 id="of-{kind}"{wrong}>{title}</h2>\n{find}'
+        f'<table class="{names}" aria-labelledby="of-{kind}">\n<colgroup>{widths}</colgroup>\n'
+        f"<thead><tr>{heads}</tr></thead>\n<tbody>\n"
+    )
 
 
 def _attribute(name: str, value: str) -> str:
@@ -349,8 +406,10 @@ def _rows_in(value: Any) -> list[Mapping[str, Any]]:
 
 def _levels(stated: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     """Return the rows of all levels of a manifest, the irradiance last."""
-    return [*(row for what in ("levels", "latlong_levels", "octahedral_levels") for row in _rows_in(stated.get(what))),
-            _dict(stated.get("irradiance"))]
+    return [
+        *(row for what in ("levels", "latlong_levels", "octahedral_levels") for row in _rows_in(stated.get(what))),
+        _dict(stated.get("irradiance")),
+    ]
 
 
 def _size_of(stated: Mapping[str, Any]) -> int:
@@ -399,8 +458,12 @@ def _about(stated: Mapping[str, Any]) -> str:
 def _table_about(stated: Mapping[str, Any]) -> str:
     """Return integral, models, shape and rule of a table, in one line."""
     models = [str(_dict(one).get("name", "")) for one in _dict(stated.get("models")).values()]
-    parts = [str(stated.get("integral", "")), ", ".join(models),
-             " × ".join(map(str, _list(stated.get("shape")))), str(stated.get("rule", ""))]
+    parts = [
+        str(stated.get("integral", "")),
+        ", ".join(models),
+        " × ".join(map(str, _list(stated.get("shape")))),
+        str(stated.get("rule", "")),
+    ]
     return " · ".join(part for part in parts if part)
 
 
@@ -448,14 +511,18 @@ def _share(share: float | None) -> str:
     if share is None:
         return _cell(None, "–")
     width = 80 * min(max(share, 0.0), 1.0)
-    return _cell(share, f'{100 * share:.3g} %<svg width="80" height="4" aria-hidden="true"><rect class="rail" '
-                        f'width="80" height="4"/><rect class="bar" width="{width:.1f}" height="4"/></svg>')
+    return _cell(
+        share,
+        f'{100 * share:.3g} %<svg width="80" height="4" aria-hidden="true"><rect class="rail" '
+        f'width="80" height="4"/><rect class="bar" width="{width:.1f}" height="4"/></svg>',
+    )
 
 
 def _energy(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return a cell with the energy kept by the level furthest from 100 %; it sorts by that distance."""
-    kept = [(abs(e - 1), e, row.get("size")) for row in rows
-            if (e := _finite_number(row.get("energy_kept"))) is not None]
+    kept = [
+        (abs(e - 1), e, row.get("size")) for row in rows if (e := _finite_number(row.get("energy_kept"))) is not None
+    ]
     if not kept:
         return _cell(None, "–")
     off, e, size = max(kept, key=lambda one: one[0])

@@ -3,6 +3,7 @@
 The whole job is checked before any item runs. An item runs by the same functions in this process, in a worker process
 and on a cluster.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -195,15 +196,22 @@ class Job:
 
         An item that is added at the end of a job does not move the others to another shard.
         """
-        return replace(self, items=self.items[k - 1::n])
+        return replace(self, items=self.items[k - 1 :: n])
 
     def predicted(self) -> Iterator[Result]:
         """Predict the result of each item from headers and digests, without running it."""
         return map(predict, self.items)
 
 
-def job(path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = None, allow_kernels: bool = False,
-        force: bool = False, device: str | None = None, send: bool = False) -> Job:
+def job(
+    path: str | os.PathLike[str],
+    *,
+    root: str | os.PathLike[str] | None = None,
+    allow_kernels: bool = False,
+    force: bool = False,
+    device: str | None = None,
+    send: bool = False,
+) -> Job:
     """Read a job file (TOML) and check it completely. No item runs, and no image is decoded.
 
     root: the folder that outputs stay below, by default that of the job file. allow_kernels: whether recipes may name
@@ -222,14 +230,25 @@ def job(path: str | os.PathLike[str], *, root: str | os.PathLike[str] | None = N
         elif not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             wrong.append(f"{name} is not a list of tables; write [[{name}]]")
         else:
-            tables_ += [(f"{name}[{k}]", made) for k, entry in enumerate(entries)
-                        if (made := _converted(TABLES[name], entry, f"{name}[{k}]", wrong))]
+            tables_ += [
+                (f"{name}[{k}]", made)
+                for k, entry in enumerate(entries)
+                if (made := _converted(TABLES[name], entry, f"{name}[{k}]", wrong))
+            ]
     if not data and not wrong:
         wrong.append("it has no [[bake]] and no [[lut]]")
     _raise_all(path, wrong)
     base = Path(os.path.realpath(path)).parent
-    maker = _Maker(path, base, Path(os.path.realpath(root if root is not None else base)), allow_kernels, force, device,
-                   send, wrong)
+    maker = _Maker(
+        path,
+        base,
+        Path(os.path.realpath(root if root is not None else base)),
+        allow_kernels,
+        force,
+        device,
+        send,
+        wrong,
+    )
     for place, table in tables_:
         if isinstance(table, Bake):
             maker.outputs(place, table)
@@ -301,8 +320,17 @@ def _converted(kind: type[Bake] | type[Lut], entry: dict[str, Any], place: str, 
 class _Maker:
     """Makes the items of a job from its tables, and collects the mistakes in `wrong`."""
 
-    def __init__(self, path: Path, base: Path, root: Path, allow_kernels: bool, force: bool, device: str | None,
-                 send: bool, wrong: list[str]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        base: Path,
+        root: Path,
+        allow_kernels: bool,
+        force: bool,
+        device: str | None,
+        send: bool,
+        wrong: list[str],
+    ) -> None:
         self.path, self.base, self.root = path, base, root
         self.allow_kernels, self.force, self.device, self.send = allow_kernels, force, device, send
         self.wrong = wrong
@@ -315,8 +343,9 @@ class _Maker:
 
     def job(self) -> Job:
         missing = sorted((folder for folder in self.folders if not folder.exists()), reverse=True)
-        return Job(self.path, self.root, tuple(self.items), tuple(self.named), tuple(self.finder.looked),
-                   tuple(missing))
+        return Job(
+            self.path, self.root, tuple(self.items), tuple(self.named), tuple(self.finder.looked), tuple(missing)
+        )
 
     def _into(self, folder: Path) -> None:
         """Note a folder that is written to, and its parents."""
@@ -346,8 +375,10 @@ class _Maker:
         if all(_below(self.root, where) for where in (plain, real)):
             return Path(plain)
         if report:
-            self.wrong.append(f"{place}.output {output!r} is outside {self.root}; outputs are relative to the job "
-                              "file's folder and stay below it, or below the folder of -o")
+            self.wrong.append(
+                f"{place}.output {output!r} is outside {self.root}; outputs are relative to the job "
+                "file's folder and stay below it, or below the folder of -o"
+            )
         return None
 
     def _models(self, place: str, table: Bake | Lut) -> tuple[dict[str, str], bool]:
@@ -358,12 +389,14 @@ class _Maker:
             file = file_of(spec) if spec else None
             if spec and file:
                 if not self.allow_kernels:
-                    self.wrong.append(f"{place}.{option} names {file}, whose text a device would run: give "
-                                      "--allow-kernels where you trust it")
+                    self.wrong.append(
+                        f"{place}.{option} names {file}, whose text a device would run: give "
+                        "--allow-kernels where you trust it"
+                    )
                     return {}, False
                 own = self.base / file
                 self.named[own] = None
-                found[option] = f"{own}{spec[len(file):]}"
+                found[option] = f"{own}{spec[len(file) :]}"
         return found, True
 
     def bake(self, place: str, table: Bake) -> None:
@@ -382,8 +415,11 @@ class _Maker:
             return
         if output is None or not allowed:
             return
-        options = {name: value for name in table.__struct_fields__
-                   if name not in ("environments", "output") and (value := getattr(table, name)) is not None}
+        options = {
+            name: value
+            for name in table.__struct_fields__
+            if name not in ("environments", "output") and (value := getattr(table, name)) is not None
+        }
         options |= models
         options["for_"] = ",".join(files or ["raw"])
         try:
@@ -416,8 +452,21 @@ class _Maker:
                 continue
             where = f"{place}: {os.path.relpath(source, self.base) if _below(self.base, source) else source}"
             self._take(where, [os.path.join(output, one.replace(_STEM, name)) for one in relative])
-            self.items.append(Item(len(self.items), "bake", where, name, source, str(output), str(self.root), recipe,
-                                   self.force, self.device, self.send))
+            self.items.append(
+                Item(
+                    len(self.items),
+                    "bake",
+                    where,
+                    name,
+                    source,
+                    str(output),
+                    str(self.root),
+                    recipe,
+                    self.force,
+                    self.device,
+                    self.send,
+                )
+            )
 
     def _environments(self, pattern: str) -> list[str]:
         """Return the paths that a path or pattern names, or the word demo. Raises InputError where there are none."""
@@ -444,8 +493,11 @@ class _Maker:
         models, allowed = self._models(place, table)
         if output is None or not allowed:
             return
-        options = {name: value for name in table.__struct_fields__
-                   if name not in ("kind", "output") and (value := getattr(table, name)) not in (None, [])}
+        options = {
+            name: value
+            for name in table.__struct_fields__
+            if name not in ("kind", "output") and (value := getattr(table, name)) not in (None, [])
+        }
         options |= models
         if table.for_ is not None and table.for_.lower().endswith(".toml"):
             options["for_"] = str(self.base / table.for_)
@@ -468,8 +520,20 @@ class _Maker:
         where = f"{place}: {table.output}"
         self._into(output.parent)
         self._take(where, [str(output), f"{output}.json"])
-        self.items.append(Item(len(self.items), "lut", where, output.name, table.kind, str(output), str(self.root),
-                               recipe, self.force, self.device))
+        self.items.append(
+            Item(
+                len(self.items),
+                "lut",
+                where,
+                output.name,
+                table.kind,
+                str(output),
+                str(self.root),
+                recipe,
+                self.force,
+                self.device,
+            )
+        )
 
     def _take(self, place: str, files: Iterable[str]) -> None:
         """Note the files that an item writes; it is a mistake if another item writes one of them."""
@@ -600,8 +664,17 @@ def _bake_plan(recipe: str, output: str, force: bool) -> baking.BakePlan:
 def _table_plan(recipe: str, kind: str, output: str, force: bool) -> tables.TablePlan:
     options = json.loads(recipe)["options"]
     axes, fixed = options.pop("axis", []), options.pop("set", [])
-    return tables.plan(tables.TableRequest(kind, output, force=force, stored=options.pop("format", None),
-                                           axes=named_axes("axis", axes), parameters=named("set", fixed), **options))
+    return tables.plan(
+        tables.TableRequest(
+            kind,
+            output,
+            force=force,
+            stored=options.pop("format", None),
+            axes=named_axes("axis", axes),
+            parameters=named("set", fixed),
+            **options,
+        )
+    )
 
 
 # ---------------------------------------------------------------------------------------------- doing
@@ -627,8 +700,9 @@ class Computed:
 
 def failed(item: Item, message: str, exit_code: int = 2) -> Result:
     """Return the result of an item that failed, with the reason and the exit code."""
-    return Result(item.index, item.kind, item.place, item.name, "failed", item.output, message=message,
-                  exit_code=exit_code)
+    return Result(
+        item.index, item.kind, item.place, item.name, "failed", item.output, message=message, exit_code=exit_code
+    )
 
 
 def _failure(item: Item, error: Exception) -> Result:
@@ -716,8 +790,9 @@ def do(item: Item) -> Result:
 
 def _one(item: Item, source: str | None = None) -> baking.BakePlan:
     """Return the plan of one item, reading `source` in place of the item's own where it is given."""
-    return replace(_bake_plan(item.recipe, item.output, item.force), names=(item.name,),
-                   sources=(source or item.source,))
+    return replace(
+        _bake_plan(item.recipe, item.output, item.force), names=(item.name,), sources=(source or item.source,)
+    )
 
 
 MOST_SENT = 1 << 30
@@ -759,8 +834,14 @@ def _source(item: Item) -> Iterator[str]:
 
 def _check_inside(item: Item) -> None:
     """Refuse output folders outside the root, links followed. A link may be newer than the check of the job."""
-    folders = {Path(item.output).parent} if item.kind == "lut" else {Path(item.output), *(
-        t.path.parent for t in baking.targets_of(_bake_plan(item.recipe, item.output, item.force), _STEM))}
+    folders = (
+        {Path(item.output).parent}
+        if item.kind == "lut"
+        else {
+            Path(item.output),
+            *(t.path.parent for t in baking.targets_of(_bake_plan(item.recipe, item.output, item.force), _STEM)),
+        }
+    )
     for folder in sorted(folders):
         if not _below(item.root, os.path.realpath(folder)):
             raise FileError(f"{folder} leads out of {item.root}: outputs stay below it; give -o where that is meant")
@@ -769,20 +850,45 @@ def _check_inside(item: Item) -> None:
 def _of_baked(item: Item, baked: baking.Baked, seconds: dict[str, float]) -> Result:
     manifest = baked.manifest
     entries = manifest.get("files", {})
-    errors = [row["error"] for row in (*baked.levels, manifest.get("irradiance", {}))
-              if isinstance(row, dict) and isinstance(row.get("error"), float)]
+    errors = [
+        row["error"]
+        for row in (*baked.levels, manifest.get("irradiance", {}))
+        if isinstance(row, dict) and isinstance(row.get("error"), float)
+    ]
     files = {str(Path(item.output, name)): int(entry.get("bytes", 0)) for name, entry in entries.items()}
     files = files or {str(path): n for path, n in zip(baked.files, baked.nbytes, strict=True)}
-    return Result(item.index, item.kind, item.place, item.name, baked.state, item.output,  # type: ignore[arg-type]
-                  str(Path(item.output, f"{item.name}.json")), seconds, sum(files.values()), files,
-                  max(errors, default=None), notices=baked.notices)
+    return Result(
+        item.index,
+        item.kind,
+        item.place,
+        item.name,
+        baked.state,
+        item.output,  # type: ignore[arg-type]
+        str(Path(item.output, f"{item.name}.json")),
+        seconds,
+        sum(files.values()),
+        files,
+        max(errors, default=None),
+        notices=baked.notices,
+    )
 
 
 def _of_table(item: Item, table: tables.Table, seconds: dict[str, float]) -> Result:
     nbytes = int(table.manifest.get("bytes", table.nbytes))
-    return Result(item.index, item.kind, item.place, item.name, table.state, item.output,  # type: ignore[arg-type]
-                  f"{item.output}.json", seconds, nbytes, {item.output: nbytes}, table.manifest.get("error"),
-                  notices=table.notices)
+    return Result(
+        item.index,
+        item.kind,
+        item.place,
+        item.name,
+        table.state,
+        item.output,  # type: ignore[arg-type]
+        f"{item.output}.json",
+        seconds,
+        nbytes,
+        {item.output: nbytes},
+        table.manifest.get("error"),
+        notices=table.notices,
+    )
 
 
 # ---------------------------------------------------------------------------------------------- what would be done
@@ -802,8 +908,9 @@ def predict(item: Item) -> Result:
     try:
         _check_inside(item)
         if item.kind == "lut":
-            return _of_table(item, tables.make(_table_plan(item.recipe, item.source, item.output, item.force),
-                                               dry_run=True), {})
+            return _of_table(
+                item, tables.make(_table_plan(item.recipe, item.source, item.output, item.force), dry_run=True), {}
+            )
         order = _one(item)
         found = _of_baked(item, baking.status(order, 0), {})
         if found.state == "skipped":
@@ -827,8 +934,14 @@ def predict(item: Item) -> Result:
 STAGES = pool.Stages(prepare, compute, write, abandon, failed, Result, load)
 
 
-def run(job: Job, *, workers: int = 1, scheduler: str | None = None, on_result: Callable[[Result], None],
-        on_notice: Callable[[str], None] | None = None) -> None:
+def run(
+    job: Job,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    on_result: Callable[[Result], None],
+    on_notice: Callable[[str], None] | None = None,
+) -> None:
     """Run every item of a job, and remove the files that killed runs left in its folders.
 
     workers: number of processes on this machine. scheduler: address of a Dask scheduler to run on instead. on_result

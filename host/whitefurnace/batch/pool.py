@@ -3,6 +3,7 @@
 The caller supplies the stages. Within a process they overlap: while one item is computed, the next ones are read and
 the last one is written. An item that fails, or kills its process, does not affect the others.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -68,9 +69,16 @@ class Stages:
     load: Callable[[Any], Any] | None = None
 
 
-def run(stages: Stages, items: Iterable[Any], *, workers: int = 1, scheduler: str | None = None,
-        on_result: Callable[[Any], None], on_notice: Callable[[str], None] | None = None,
-        stop: threading.Event | None = None) -> None:
+def run(
+    stages: Stages,
+    items: Iterable[Any],
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    on_result: Callable[[Any], None],
+    on_notice: Callable[[str], None] | None = None,
+    stop: threading.Event | None = None,
+) -> None:
     """Run every item through the stages.
 
     items: taken one by one as there is room, so it may be endless. workers: 1 runs in this process, more in as many
@@ -172,8 +180,9 @@ class Pipeline:
     ends, in any of the three threads.
     """
 
-    def __init__(self, stages: Stages, source: Callable[[], tuple[int, Any] | None],
-                 emit: Callable[[int, Any, Any], None]) -> None:
+    def __init__(
+        self, stages: Stages, source: Callable[[], tuple[int, Any] | None], emit: Callable[[int, Any, Any], None]
+    ) -> None:
         self._stages = stages
         self._source = source
         self._emit = emit
@@ -306,8 +315,11 @@ def _here(stages: Stages, items: Iterable[Any], on_result: Callable[[Any], None]
             while True:
                 on_result(results.get_nowait())
 
-    pipeline = Pipeline(stages, lambda: None if interrupts.stop.is_set() else next(source, None),
-                        lambda ticket, item, result: results.put(result))
+    pipeline = Pipeline(
+        stages,
+        lambda: None if interrupts.stop.is_set() else next(source, None),
+        lambda ticket, item, result: results.put(result),
+    )
     try:
         pipeline.run(idle)
     finally:
@@ -375,8 +387,9 @@ class _Marked:
             finally:
                 self.computed.set()
 
-        return Stages(self.inner.prepare, compute, self.inner.write, self.inner.abandon, self.inner.failed,
-                      self.inner.result)
+        return Stages(
+            self.inner.prepare, compute, self.inner.write, self.inner.abandon, self.inner.failed, self.inner.result
+        )
 
 
 def _leave() -> None:
@@ -400,8 +413,15 @@ class _Worker:
 class _Crew:
     """The worker processes of a run."""
 
-    def __init__(self, stages: Stages, items: Iterable[Any], count: int, on_result: Callable[[Any], None],
-                 report: Callable[[str], None], interrupts: _Interrupts) -> None:
+    def __init__(
+        self,
+        stages: Stages,
+        items: Iterable[Any],
+        count: int,
+        on_result: Callable[[Any], None],
+        report: Callable[[str], None],
+        interrupts: _Interrupts,
+    ) -> None:
         self.stages = stages
         self.source = enumerate(items)
         self.count = count
@@ -440,8 +460,9 @@ class _Crew:
         ours, theirs = context.Pipe()
         # Where the cores do not divide evenly, the first few workers get one more.
         share = max(cores() // self.count + (number < cores() % self.count), 1)
-        process = context.Process(target=_serve, args=(self.stages, theirs), name=f"whitefurnace worker {number}",
-                                  daemon=True)
+        process = context.Process(
+            target=_serve, args=(self.stages, theirs), name=f"whitefurnace worker {number}", daemon=True
+        )
         with self.interrupts.held(), _environment(core_limit(share)):
             process.start()
         theirs.close()
@@ -612,8 +633,9 @@ _services_lock = threading.Lock()
 def _do(stages: Stages, item: Any, version: str) -> Any:
     """Run an item on a Dask worker, as the task that `_Call` unpickles to."""
     if version != VERSION:
-        return stages.failed(item, f"its worker has whitefurnace {VERSION}, the batch {version}",
-                             UnsupportedError.exit_code)
+        return stages.failed(
+            item, f"its worker has whitefurnace {VERSION}, the batch {version}", UnsupportedError.exit_code
+        )
     with _services_lock:
         if stages not in _services:
             _services[stages] = _Service(stages)
@@ -651,8 +673,14 @@ def _settle(neighbours: Mapping[str, int], dask_worker: Any) -> str:
     return VERSION
 
 
-def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: Callable[[Any], None],
-                report: Callable[[str], None], interrupts: _Interrupts) -> None:
+def _on_cluster(
+    stages: Stages,
+    items: Iterable[Any],
+    address: str,
+    on_result: Callable[[Any], None],
+    report: Callable[[str], None],
+    interrupts: _Interrupts,
+) -> None:
     try:
         import distributed
     except ImportError:
@@ -686,8 +714,16 @@ def _on_cluster(stages: Stages, items: Iterable[Any], address: str, on_result: C
 class _Cluster:
     """A run on a Dask cluster. At most WINDOW items for each worker are submitted at a time."""
 
-    def __init__(self, stages: Stages, items: Iterable[Any], address: str, client: Any,
-                 on_result: Callable[[Any], None], report: Callable[[str], None], interrupts: _Interrupts) -> None:
+    def __init__(
+        self,
+        stages: Stages,
+        items: Iterable[Any],
+        address: str,
+        client: Any,
+        on_result: Callable[[Any], None],
+        report: Callable[[str], None],
+        interrupts: _Interrupts,
+    ) -> None:
         self.stages = stages
         self.source = enumerate(items)
         self.address = address
@@ -727,8 +763,9 @@ class _Cluster:
     def _gone(self) -> FileError:
         """Return the error for a lost scheduler."""
         done = "1 item was" if self.done == 1 else f"{self.done} items were"
-        return FileError(f"the scheduler at {self.address} is gone: {done} done before; run it again to go on with the "
-                         f"rest")
+        return FileError(
+            f"the scheduler at {self.address} is gone: {done} done before; run it again to go on with the rest"
+        )
 
     def _look(self) -> None:
         """Every two seconds, look which workers there are, and limit new ones to their share of the cores."""
@@ -745,20 +782,25 @@ class _Cluster:
         able = {name: facts["host"] for name, facts in workers.items() if facts["resources"].get(RESOURCE, 0) >= SHARE}
         if not able and not self.lonely:
             self.lonely = True
-            self.report(f"waiting: no worker at {self.address} declares {RESOURCE}=1 "
-                      f"(dask worker {self.address} --nthreads 4 --resources {RESOURCE}=1)")
+            self.report(
+                f"waiting: no worker at {self.address} declares {RESOURCE}=1 "
+                f"(dask worker {self.address} --nthreads 4 --resources {RESOURCE}=1)"
+            )
         fresh = [name for name in able if name not in self.settled]
         if fresh:
             hosts = list(able.values())
-            versions = self.client.run(_settle, {name: hosts.count(host) for name, host in able.items()},
-                                       workers=fresh, on_error="return")
+            versions = self.client.run(
+                _settle, {name: hosts.count(host) for name, host in able.items()}, workers=fresh, on_error="return"
+            )
             for name, version in versions.items():
                 if isinstance(version, ImportError):
-                    raise UnsupportedError(f"the worker {name} has no whitefurnace {VERSION}: install it there "
-                                           f"({_message(version)})")
+                    raise UnsupportedError(
+                        f"the worker {name} has no whitefurnace {VERSION}: install it there ({_message(version)})"
+                    )
                 if isinstance(version, str) and version != VERSION:
-                    raise UnsupportedError(f"the worker {name} has whitefurnace {version}, this is {VERSION}: install "
-                                           f"the same on both")
+                    raise UnsupportedError(
+                        f"the worker {name} has whitefurnace {version}, this is {VERSION}: install the same on both"
+                    )
             self.settled.update(fresh)
         self.window = WINDOW * len(able)
 

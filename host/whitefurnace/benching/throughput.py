@@ -1,6 +1,7 @@
 """Measures the throughput of every kernel, and its ratio to the multiply-adds and the memory bandwidth of the same
 device. These yardsticks run next to each case, since absolute figures of a shared machine vary by a factor of 2 to 4
 within the hour."""
+
 from __future__ import annotations
 
 import math
@@ -245,15 +246,19 @@ class BenchMeter:
         device, lanes = self.device, self.device.lanes(precision)
         kind = np.dtype(f"f{precision // 8}")
         kernel = device.build(source.yardstick().text, {"W": lanes, "T": 1, "PRECISION": precision}).kernel(
-            "multiply_add")
+            "multiply_add"
+        )
         items = GROUPS * device.local_size
         start = device.array(np.linspace(1, 2, CHAINS * lanes).astype(kind))
         out = device.empty(items * lanes, kind)
 
         def make(scale: int) -> Work:
             arguments = out, np.int32(16 * scale), kind.type(0.5), kind.type(0.25), start
-            return Work(lambda _: device.launch(kernel, (items,), arguments),
-                        2.0 * CHAINS * STEPS_A_ROUND * lanes * 16 * scale * items, 0)
+            return Work(
+                lambda _: device.launch(kernel, (items,), arguments),
+                2.0 * CHAINS * STEPS_A_ROUND * lanes * 16 * scale * items,
+                0,
+            )
 
         return _enough(device, make, self.least / 2)
 
@@ -266,9 +271,14 @@ class BenchMeter:
         program = device.build(source.yardstick().text, {"W": lanes, "T": 1, "PRECISION": 32})
         count, out = np.int32(floats // (items * lanes)), device.empty(items * lanes, np.float32)
         read, triad = program.kernel("read"), program.kernel("triad")
-        return (Work(lambda _: device.launch(read, (items,), (out, count, arrays[0])), self.stream, self.stream),
-                Work(lambda _: device.launch(triad, (items,), (arrays[0], count, np.float32(0.5), *arrays[1:])),
-                     3.0 * self.stream, 3.0 * self.stream))
+        return (
+            Work(lambda _: device.launch(read, (items,), (out, count, arrays[0])), self.stream, self.stream),
+            Work(
+                lambda _: device.launch(triad, (items,), (arrays[0], count, np.float32(0.5), *arrays[1:])),
+                3.0 * self.stream,
+                3.0 * self.stream,
+            ),
+        )
 
     def yardstick(self) -> Yardstick:
         """The limits measured so far; those that were not are measured in RUNS runs now."""
@@ -310,15 +320,27 @@ def _convolve(device: Device, precision: int, scale: int) -> Work:
     step = lanes * device.vectors * device.local_size
     outputs, sources = -(-512 * scale // step) * step, 2 * planning.CHUNK
     entry = model("ndf", "ggx")
-    kernel = device.build(source.convolution(entry).text, {
-        "W": lanes, "T": device.vectors, "PRECISION": precision}).kernel("convolve")
+    kernel = device.build(
+        source.convolution(entry).text, {"W": lanes, "T": device.vectors, "PRECISION": precision}
+    ).kernel("convolve")
     listed = np.zeros((sources, 8), kind)
     listed[:, :3], listed[:, 3:7] = _directions(sources).T, _rng().random((sources, 4))
-    arguments = (device.empty((2, 4, outputs), kind), np.int32(outputs), np.int32(sources), np.int32(planning.CHUNK),
-                 device.array(_directions(outputs).astype(kind)), device.array(listed), kind.type(0), kind.type(0),
-                 *(kind.type(number) for number in numbers_of(device, entry, np.array([[0.25]]))[:, 0]))
-    return Work(lambda _: device.launch(kernel, (outputs // lanes // device.vectors, 2), arguments),
-                float(outputs) * sources, kind.itemsize * (8 * sources + (3 + 8) * outputs))
+    arguments = (
+        device.empty((2, 4, outputs), kind),
+        np.int32(outputs),
+        np.int32(sources),
+        np.int32(planning.CHUNK),
+        device.array(_directions(outputs).astype(kind)),
+        device.array(listed),
+        kind.type(0),
+        kind.type(0),
+        *(kind.type(number) for number in numbers_of(device, entry, np.array([[0.25]]))[:, 0]),
+    )
+    return Work(
+        lambda _: device.launch(kernel, (outputs // lanes // device.vectors, 2), arguments),
+        float(outputs) * sources,
+        kind.itemsize * (8 * sources + (3 + 8) * outputs),
+    )
 
 
 def _ggx(device: Device) -> Lobe:
@@ -333,32 +355,40 @@ def _octahedral(device: Device, precision: int, scale: int) -> Work:
     grid = device.array(_rng().random((6, n, n, 4)).astype(kind))
     lobe, whole = _ggx(device), planning.Part(n, None, None)
     classes = symmetries.classes(n, grid, 6)
-    tiles = [(found, symmetries.empty(planning.splits_for(found.padded // symmetries.lanes, 3 * n * n // 4), found))
-             for found in symmetries.orbits(shape)]
+    tiles = [
+        (found, symmetries.empty(planning.splits_for(found.padded // symmetries.lanes, 3 * n * n // 4), found))
+        for found in symmetries.orbits(shape)
+    ]
 
     def run(_: Any) -> None:
         for found, sums in tiles:
             symmetries.convolve(sums, 0, sums.shape[0], found, lobe, whole, classes, 1e-5)
 
-    return Work(run, 6.0 * n * n * shape.count,
-                float(classes.node.nbytes + classes.moment.nbytes + sum(sums.nbytes for _, sums in tiles)))
+    return Work(
+        run,
+        6.0 * n * n * shape.count,
+        float(classes.node.nbytes + classes.moment.nbytes + sum(sums.nbytes for _, sums in tiles)),
+    )
 
 
 def _samples(device: Device, precision: int, scale: int) -> Work:
     """256 samples of the same lobe a texel, each between two levels of a pyramid of 256²."""
     sampler = Sampler(Means(device, _rng().random((6, 256, 256, 3), np.float32), 0.0), precision)
     lobe, shape, pyramid = _ggx(device), Shape(False, min(8 * scale, 1024)), sampler.pyramid(256)
-    return Work(lambda _: sampler.level(lobe, shape, 256), 256.0 * shape.count,
-                pyramid.nbytes + precision / 8 * 6 * shape.count)
+    return Work(
+        lambda _: sampler.level(lobe, shape, 256), 256.0 * shape.count, pyramid.nbytes + precision / 8 * 6 * shape.count
+    )
 
 
 def _truth(device: Device, precision: int, scale: int) -> tuple[Truth, Term, Points]:
     """Points of a sphere under a noise, GGX at α = ¼ and Schlick's Fresnel of two F0."""
     n = _directions(1024 * scale)
     n[2] = np.abs(n[2])
-    return (Truth(device, _noise(64), precision),
-            term(ndf="ggx", fresnel="schlick", ndf_alpha=0.25, fresnel_f0=np.array([0.04, 1.0]), fresnel_f90=1.0),
-            Points(n, np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape)))
+    return (
+        Truth(device, _noise(64), precision),
+        term(ndf="ggx", fresnel="schlick", ndf_alpha=0.25, fresnel_f0=np.array([0.04, 1.0]), fresnel_f90=1.0),
+        Points(n, np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape)),
+    )
 
 
 def _truth_samples(device: Device, precision: int, scale: int) -> Work:
@@ -366,16 +396,18 @@ def _truth_samples(device: Device, precision: int, scale: int) -> Work:
     truth, found, points = _truth(device, precision, scale)
     count = points.n.shape[1]
     pyramid = truth.rest.pyramid(truth.rest.size)
-    return Work(lambda _: truth.sums(found, points, 256, truth.rest), 256.0 * count,
-                pyramid.nbytes + precision / 8 * count * 16)
+    return Work(
+        lambda _: truth.sums(found, points, 256, truth.rest), 256.0 * count, pyramid.nbytes + precision / 8 * count * 16
+    )
 
 
 def _truth_lights(device: Device, precision: int, scale: int) -> Work:
     """1 024 lights a point."""
     truth, found, points = _truth(device, precision, scale)
     count, lights = points.n.shape[1], np.concatenate([_directions(1024).T, _rng().random((1024, 3))], 1)
-    return Work(lambda _: truth.gathered(found, points, lights), 1024.0 * count,
-                precision / 8 * (8 * 1024 + count * 14))
+    return Work(
+        lambda _: truth.gathered(found, points, lights), 1024.0 * count, precision / 8 * (8 * 1024 + count * 14)
+    )
 
 
 def _pyramid(device: Device, precision: int, scale: int) -> Work:
@@ -383,16 +415,24 @@ def _pyramid(device: Device, precision: int, scale: int) -> Work:
     size = 1 << min(4 + scale.bit_length(), 10)
     means, texels = Means(device, _rng().random((6, size, size, 3), np.float32), 0.0), 6.0 * size**2
     # A texel has 4 scalars; the coarser levels, which read what was written, add a third.
-    return Work(lambda sampler: sampler.pyramid(size), texels, texels * (12 + precision / 8 * 4 * (4 / 3 + 1)),
-                lambda: Sampler(means, precision))
+    return Work(
+        lambda sampler: sampler.pyramid(size),
+        texels,
+        texels * (12 + precision / 8 * 4 * (4 / 3 + 1)),
+        lambda: Sampler(means, precision),
+    )
 
 
 def _anterpolate(device: Device, precision: int, scale: int) -> Work:
     """A lat-long's texels onto the grid of 64² nodes a face."""
     env = _noise(rows := min(64 * scale, 2048))
     texels = 2.0 * rows**2
-    return Work(lambda light: light.prepare(64, 1), texels, 12 * texels + precision / 8 * 6 * 64**2 * 4,
-                lambda: Texels(device, env, precision))
+    return Work(
+        lambda light: light.prepare(64, 1),
+        texels,
+        12 * texels + precision / 8 * 6 * 64**2 * 4,
+        lambda: Texels(device, env, precision),
+    )
 
 
 def _apart(device: Device, precision: int, scale: int) -> Work:
@@ -419,8 +459,10 @@ def _interpolate(device: Device, precision: int, scale: int) -> Work:
 
 def _near_texels(device: Device, precision: int, scale: int) -> Work:
     """GGX at α = .005 in some directions over a lat-long of 64 rows, the list of its parts included."""
-    convolver, lobe = Convolver(device, _noise(64), precision=precision), ndf_lobe(
-        device, chosen("ndf", "ggx"), math.sqrt(0.005), {"alpha": 0.005})
+    convolver, lobe = (
+        Convolver(device, _noise(64), precision=precision),
+        ndf_lobe(device, chosen("ndf", "ggx"), math.sqrt(0.005), {"alpha": 0.005}),
+    )
     directions = _directions(16 * scale)
     return Work(lambda _: convolver.exact_narrow(lobe, directions, 64, 1e-3), 16.0 * scale, float(12 * 64 * 128))
 
@@ -429,59 +471,122 @@ def _means(device: Device, precision: int, scale: int) -> Work:
     """Of a lat-long over the texels of a cube of 128²."""
     rows = min(64 * scale, 2048)
     texels = _rng().random((rows, 2 * rows, 3), np.float32)
-    return Work(lambda means: means.level(Shape(False, 128)), texels.size / 3, texels.nbytes + 12 * 6 * 128**2,
-                lambda: Means(device, texels, 0.0))
+    return Work(
+        lambda means: means.level(Shape(False, 128)),
+        texels.size / 3,
+        texels.nbytes + 12 * 6 * 128**2,
+        lambda: Means(device, texels, 0.0),
+    )
 
 
 def _means_of_cube(device: Device, precision: int, scale: int) -> Work:
     """Of a turned cube over the texels of another of half its size."""
     size = min(8 * scale, 512)
     texels = _rng().random((6, 2 * size, 2 * size, 3), np.float32)
-    return Work(lambda means: means.level(Shape(False, size)), texels.size / 3, texels.nbytes + 12 * 6 * size**2,
-                lambda: Means(device, texels, 0.5))
+    return Work(
+        lambda means: means.level(Shape(False, size)),
+        texels.size / 3,
+        texels.nbytes + 12 * 6 * size**2,
+        lambda: Means(device, texels, 0.5),
+    )
 
 
-def _sum(device: Device, text: str, kernel: str, cells: np.ndarray, components: int, precision: int, rule: Rule,
-         azimuths: bool = True) -> Work:
+def _sum(
+    device: Device,
+    text: str,
+    kernel: str,
+    cells: np.ndarray,
+    components: int,
+    precision: int,
+    rule: Rule,
+    azimuths: bool = True,
+) -> Work:
     """A kernel that sums over the nodes of a rule for each cell."""
     rows, count = cells.shape
-    return Work(lambda _: over_nodes(device, text, kernel, cells, components, precision, rule, azimuths),
-                float(count) * rule.evaluations, precision / 8 * count * (rows + components))
+    return Work(
+        lambda _: over_nodes(device, text, kernel, cells, components, precision, rule, azimuths),
+        float(count) * rule.evaluations,
+        precision / 8 * count * (rows + components),
+    )
 
 
 def _dfg(device: Device, precision: int, scale: int) -> Work:
     slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith")}
-    return _sum(device, source.integration(integral("dfg"), slots).text, "integrate",
-                _cells((0, 1), (0.01, 1), count=2048 * scale), 2, precision, LADDERS["gauss"][4])
+    return _sum(
+        device,
+        source.integration(integral("dfg"), slots).text,
+        "integrate",
+        _cells((0, 1), (0.01, 1), count=2048 * scale),
+        2,
+        precision,
+        LADDERS["gauss"][4],
+    )
 
 
 def _dfg_closed(device: Device, precision: int, scale: int) -> Work:
     slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith")}
-    return _sum(device, source.closed("dfg_ggx.cl", slots).text, "integrate",
-                _cells((0.01, 1), (0.01, 1), count=2048 * scale), 2, precision, LADDERS["light-angles"][4])
+    return _sum(
+        device,
+        source.closed("dfg_ggx.cl", slots).text,
+        "integrate",
+        _cells((0.01, 1), (0.01, 1), count=2048 * scale),
+        2,
+        precision,
+        LADDERS["light-angles"][4],
+    )
 
 
 def _glass(device: Device, precision: int, scale: int) -> Work:
-    slots = {slot: model(slot, name) for slot, name in (("ndf", "ggx"), ("masking", "smith"),
-                                                        ("fresnel", "dielectric"))}
-    return _sum(device, source.refraction(slots).text, "integrate",
-                _cells((0.01, 1), (0.01, 1), (0.4, 3), count=2048 * scale), 2, precision, LADDERS["refraction"][2])
+    slots = {
+        slot: model(slot, name) for slot, name in (("ndf", "ggx"), ("masking", "smith"), ("fresnel", "dielectric"))
+    }
+    return _sum(
+        device,
+        source.refraction(slots).text,
+        "integrate",
+        _cells((0.01, 1), (0.01, 1), (0.4, 3), count=2048 * scale),
+        2,
+        precision,
+        LADDERS["refraction"][2],
+    )
 
 
 def _dfg_anisotropic(device: Device, precision: int, scale: int) -> Work:
     slots = {"ndf": model("ndf", "ggx_anisotropic"), "masking": model("masking", "smith")}
-    return _sum(device, source.integration(integral("dfg"), slots).text, "integrate",
-                _cells((0, 1), (0, 1), (0.1, 1), (0.1, 1), count=1024 * scale), 2, precision, LADDERS["stretched"][4])
+    return _sum(
+        device,
+        source.integration(integral("dfg"), slots).text,
+        "integrate",
+        _cells((0, 1), (0, 1), (0.1, 1), (0.1, 1), count=1024 * scale),
+        2,
+        precision,
+        LADDERS["stretched"][4],
+    )
 
 
 def _hemisphere(device: Device, precision: int, scale: int) -> Work:
-    return _sum(device, source.hemisphere(model("diffuse", "burley")).text, "integrate",
-                _cells((0, 1), (0, 1), (0, 1), count=2048 * scale), 1, precision, LADDERS["hemisphere"][4])
+    return _sum(
+        device,
+        source.hemisphere(model("diffuse", "burley")).text,
+        "integrate",
+        _cells((0, 1), (0, 1), (0, 1), count=2048 * scale),
+        1,
+        precision,
+        LADDERS["hemisphere"][4],
+    )
 
 
 def _area(device: Device, precision: int, scale: int) -> Work:
-    return _sum(device, source.area(model("ndf", "ggx")).text, "area", _cells((0, 1), (0.01, 1), count=4096 * scale), 1,
-                precision, AREA_RULES[32][1], azimuths=False)
+    return _sum(
+        device,
+        source.area(model("ndf", "ggx")).text,
+        "area",
+        _cells((0, 1), (0.01, 1), count=4096 * scale),
+        1,
+        precision,
+        AREA_RULES[32][1],
+        azimuths=False,
+    )
 
 
 def _lobes(device: Device, precision: int, scale: int) -> Work:
@@ -492,15 +597,26 @@ def _lobes(device: Device, precision: int, scale: int) -> Work:
     polar, azimuthal = rule.tables()
     between = [*map(np.int32, rule.counts), polar, np.int32(rule.azimuths), azimuthal, soft]
     text = source.transformed(slots).text
-    return Work(lambda _: over_cells(device, text, "descend", cells, 19, precision, between),
-                float(cells.shape[1]) * rule.evaluations, precision / 8 * cells.shape[1] * (len(cells) + 19))
+    return Work(
+        lambda _: over_cells(device, text, "descend", cells, 19, precision, between),
+        float(cells.shape[1]) * rule.evaluations,
+        precision / 8 * cells.shape[1] * (len(cells) + 19),
+    )
 
 
 def _radiance_light(device: Device, precision: int, scale: int) -> Work:
     """Arcs of a disc's outline, 1 to 2 above the surface."""
     slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith"), "fresnel": model("fresnel", "one")}
-    ranges = {"NoV": (0.1, 1), "phi": (0, 6), "Cz": (1, 2), "Ax": (0.5, 1), "By": (0.5, 1), "length": (0.1, 0.5),
-              "scale": (0.1, 0.5), "alpha": (0.05, 1)}
+    ranges = {
+        "NoV": (0.1, 1),
+        "phi": (0, 6),
+        "Cz": (1, 2),
+        "Ax": (0.5, 1),
+        "By": (0.5, 1),
+        "length": (0.1, 0.5),
+        "scale": (0.1, 0.5),
+        "alpha": (0.05, 1),
+    }
     cells = _cells(*(ranges.get(name, (0, 0)) for name in ("NoV", "phi", *source.OUTLINE, "alpha")), count=1024 * scale)
     return _sum(device, source.outline(slots).text, "integrate", cells, 1, precision, Rule("outline", 20, 12, 9))
 
@@ -511,14 +627,20 @@ def _radiance_image(device: Device, precision: int, scale: int) -> Work:
     slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith"), "fresnel": model("fresnel", "one")}
     steps, items = 64, 16 * scale * device.local_size
     nodes = items * steps * lanes
-    kernel = device.build(source.lit_nodes(slots).text,
-                          {"W": lanes, "T": 1, "PRECISION": precision}).kernel("integrate")
+    kernel = device.build(source.lit_nodes(slots).text, {"W": lanes, "T": 1, "PRECISION": precision}).kernel(
+        "integrate"
+    )
     tile = np.concatenate([_directions(steps * lanes), _rng().random((4, steps * lanes))]).astype(kind)
     listed = device.array(np.tile(tile, (1, items)))
     out = device.empty((3, items * lanes), kind)
     cells = device.array(np.repeat(np.array([[0.7], [0.0], [0.25]]), lanes, 1).astype(kind))
-    return Work(lambda _: device.launch(kernel, (items, 1), (out, np.int32(lanes), np.int32(items), np.int32(steps),
-                                                             listed, cells)), nodes, kind.itemsize * 7 * nodes)
+    return Work(
+        lambda _: device.launch(
+            kernel, (items, 1), (out, np.int32(lanes), np.int32(items), np.int32(steps), listed, cells)
+        ),
+        nodes,
+        kind.itemsize * 7 * nodes,
+    )
 
 
 def _radiance_texels(device: Device, precision: int, scale: int) -> Work:
@@ -528,11 +650,24 @@ def _radiance_texels(device: Device, precision: int, scale: int) -> Work:
     count = 2 * rows * rows
     stride = -(-count // local) * local
     kernel = device.build(source.frame_nodes("latlong").text, {"W": 1, "T": 1, "PRECISION": precision}).kernel(
-        "frame_nodes")
+        "frame_nodes"
+    )
     tables = (device.array(t.astype(kind)) for t in latlong_tables(rows, 2 * rows, np.array([0.5]), np.ones(1), 0.0))
-    arguments = (device.empty((7, stride), kind), np.int32(stride), np.int32(0), np.int32(count),
-                 device.array(np.eye(3, dtype=kind)), None, np.int32(rows), np.int32(2 * rows), np.int32(1),
-                 kind.type(1), kind.type(0), *tables, device.array(_rng().random((count, 3), np.float32)))
+    arguments = (
+        device.empty((7, stride), kind),
+        np.int32(stride),
+        np.int32(0),
+        np.int32(count),
+        device.array(np.eye(3, dtype=kind)),
+        None,
+        np.int32(rows),
+        np.int32(2 * rows),
+        np.int32(1),
+        kind.type(1),
+        kind.type(0),
+        *tables,
+        device.array(_rng().random((count, 3), np.float32)),
+    )
     return Work(lambda _: device.launch(kernel, (stride,), arguments), count, count * (7.0 * kind.itemsize + 12))
 
 
@@ -541,12 +676,16 @@ def _harmonics(device: Device, precision: int, scale: int) -> Work:
     kind = np.dtype(f"f{precision // 8}")
     chunks = 16 * scale * device.local_size
     nodes = chunks * HARMONICS_CHUNK
-    kernel = device.build(source.texels("latlong").text, {
-        "W": device.lanes(precision), "T": 1, "PRECISION": precision}).kernel("harmonics")
+    kernel = device.build(
+        source.texels("latlong").text, {"W": device.lanes(precision), "T": 1, "PRECISION": precision}
+    ).kernel("harmonics")
     listed = device.array(np.tile(_rng().random((HARMONICS_CHUNK, 8)).astype(kind), (chunks, 1)))
     out = device.empty((chunks, 28), kind)
-    return Work(lambda _: device.launch(kernel, (chunks,), (out, np.int32(nodes), np.int32(HARMONICS_CHUNK), listed)),
-                nodes, kind.itemsize * 8.0 * nodes)
+    return Work(
+        lambda _: device.launch(kernel, (chunks,), (out, np.int32(nodes), np.int32(HARMONICS_CHUNK), listed)),
+        nodes,
+        kind.itemsize * 8.0 * nodes,
+    )
 
 
 def _evaluate(device: Device, precision: int, scale: int) -> Work:
@@ -554,8 +693,9 @@ def _evaluate(device: Device, precision: int, scale: int) -> Work:
     kind, lanes = np.dtype(f"f{precision // 8}"), device.lanes(precision)
     step, again = lanes * device.local_size, max(scale // 256, 1)
     count = -(-16384 * min(scale, 256) // step) * step
-    kernel = device.build(source.evaluation("NDF_D", {"ndf": model("ndf", "ggx")}).text,
-                          {"W": lanes, "T": 1, "PRECISION": precision}).kernel("evaluate")
+    kernel = device.build(
+        source.evaluation("NDF_D", {"ndf": model("ndf", "ggx")}).text, {"W": lanes, "T": 1, "PRECISION": precision}
+    ).kernel("evaluate")
     theta = np.linspace(0, 1.5, count)
     cells = np.stack([np.cos(theta), np.sin(theta) ** 2, np.linspace(0.01, 1, count)]).astype(kind)
     arguments = device.empty(count, kind), np.int32(count), device.array(cells)
@@ -619,8 +759,13 @@ def cases(names: Sequence[str]) -> tuple[Case, ...]:
     return tuple(known[name] for name in dict.fromkeys(names)) if names else CASES
 
 
-def throughput(wanted: Sequence[Case], device: Device, meter: BenchMeter, runs: int = RUNS,
-               progress: Callable[[str, float], None] | None = None) -> Iterator[Throughput]:
+def throughput(
+    wanted: Sequence[Case],
+    device: Device,
+    meter: BenchMeter,
+    runs: int = RUNS,
+    progress: Callable[[str, float], None] | None = None,
+) -> Iterator[Throughput]:
     """Measure cases one after the other, in every precision of the device, each with its yardstick next to it.
 
     runs: counted runs of a case. progress: called with the case and the share done.
@@ -643,6 +788,15 @@ def throughput(wanted: Sequence[Case], device: Device, meter: BenchMeter, runs: 
             rates.append(work.units / max(_seconds(device, work), 1e-9))
         rate, flops, nbytes = Spread.of(rates), FLOPS.get(case.name), work.nbytes / work.units
         ratio = [statistics.median(r / y / 1e9 for r, y in zip(rates, by, strict=True)) for by in (peaks, memories)]
-        yield Throughput(case.name, case.unit, precision, rate, None if flops is None else flops * rate.median / 1e9,
-                         None if flops is None else flops * ratio[0], nbytes * rate.median / 1e9, nbytes * ratio[1],
-                         work.units / rate.median, runs)
+        yield Throughput(
+            case.name,
+            case.unit,
+            precision,
+            rate,
+            None if flops is None else flops * rate.median / 1e9,
+            None if flops is None else flops * ratio[0],
+            nbytes * rate.median / 1e9,
+            nbytes * ratio[1],
+            work.units / rate.median,
+            runs,
+        )

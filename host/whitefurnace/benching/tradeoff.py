@@ -1,5 +1,6 @@
 """Measures error against time of the prefilter: every method and quality on an environment, its Pareto front, and how
 the time depends on the size of the output, on the size of the source and on α."""
+
 from __future__ import annotations
 
 import math
@@ -146,9 +147,17 @@ def methods() -> list[tuple[str, float]]:
     return [*(("tolerance", x) for x in TOLERANCES), *(("samples", n) for n in SAMPLES)]
 
 
-def points(env: Environment, device: Device, *, size: int = 256, min_size: int = 16, runs: int = RUNS,
-           budget: float = BUDGET, todo: Sequence[tuple[str, float]] | None = None,
-           progress: Callable[[str, float], None] | None = None) -> Iterator[Point | Missed]:
+def points(
+    env: Environment,
+    device: Device,
+    *,
+    size: int = 256,
+    min_size: int = 16,
+    runs: int = RUNS,
+    budget: float = BUDGET,
+    todo: Sequence[tuple[str, float]] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Iterator[Point | Missed]:
     """Measure every method and setting on one environment; those that cannot be made are `Missed`.
 
     size, min_size: of the chain. runs, budget: most runs and seconds of a point. todo: (method, setting) pairs, by
@@ -166,9 +175,19 @@ def points(env: Environment, device: Device, *, size: int = 256, min_size: int =
             yield Missed(env.name, method, setting, str(error))
             continue
         made = found[0][0]
-        yield Point(env.name, method, setting, Spread.of([seconds for _, seconds, _ in found]),
-                    Spread.of([certificate for _, _, certificate in found]).median, float(made.error.max()),
-                    float(made.worst.max()), float(made.rmse.max()), made.evaluations, made.rule, len(found))
+        yield Point(
+            env.name,
+            method,
+            setting,
+            Spread.of([seconds for _, seconds, _ in found]),
+            Spread.of([certificate for _, _, certificate in found]).median,
+            float(made.error.max()),
+            float(made.worst.max()),
+            float(made.rmse.max()),
+            made.evaluations,
+            made.rule,
+            len(found),
+        )
 
 
 def with_front(measured: Sequence[Point]) -> list[Point]:
@@ -190,11 +209,10 @@ class _One(Chain):
 
 def _level(env: Environment, device: Device, size: int, alpha: float, tolerance: float = COST_TOLERANCE) -> float:
     """Seconds of one level alone, from texels in memory, without its certificate."""
-    recipe = _One(chain(size=size, min_size=size).ndf, size, size, tolerance,
-                  roughness=math.sqrt(alpha))
+    recipe = _One(chain(size=size, min_size=size).ndf, size, size, tolerance, roughness=math.sqrt(alpha))
     begin = time.perf_counter()
     convolver = Convolver(device, env, precision=planning.precision_for(tolerance))
-    job, = chain_jobs(convolver, recipe)
+    (job,) = chain_jobs(convolver, recipe)
     assert job.lobe is not None
     convolver.convolve(job.lobe, job.shape, job.plan.grid, tolerance)
     return time.perf_counter() - begin
@@ -205,10 +223,19 @@ def resampled(env: Environment, device: Device, rows: int) -> Environment:
     return replace(environment(Means(device, env.texels, env.rotation).level(Shape(True, rows))), name=env.name)
 
 
-def costs(env: Environment, device: Device, *, size: int = 256, min_size: int = 16, runs: int = RUNS,
-          budget: float = BUDGET, sizes: Sequence[int] = SIZES, rows: Sequence[int] = ROWS,
-          alphas: Sequence[float] = ALPHAS,
-          progress: Callable[[str, float], None] | None = None) -> Iterator[Cost | Missed]:
+def costs(
+    env: Environment,
+    device: Device,
+    *,
+    size: int = 256,
+    min_size: int = 16,
+    runs: int = RUNS,
+    budget: float = BUDGET,
+    sizes: Sequence[int] = SIZES,
+    rows: Sequence[int] = ROWS,
+    alphas: Sequence[float] = ALPHAS,
+    progress: Callable[[str, float], None] | None = None,
+) -> Iterator[Cost | Missed]:
     """Measure the seconds of a chain over output sizes and source rows, and of a level over α, at COST_TOLERANCE."""
 
     def whole(some: Environment, size: int) -> float:

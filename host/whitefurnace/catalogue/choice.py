@@ -1,4 +1,5 @@
 """A model as a user chooses it: an entry of the catalogue or a file, and the parameters given with it."""
+
 from __future__ import annotations
 
 import hashlib
@@ -28,6 +29,7 @@ class Chosen:
         source = {} if text is None else {"sha256": hashlib.sha256(text.encode()).hexdigest()}
         return {"name": self.model.name, **source, **dict(sorted(self.given.items()))}
 
+
 Spec = str | os.PathLike[str] | Model | Chosen
 
 
@@ -53,7 +55,7 @@ def chosen(slot: str, spec: Spec) -> Chosen:
     spec = os.fspath(spec)
     file = file_of(spec)
     if file is not None:
-        entry, rest = user_model(slot, file), spec[len(file) + 1:]
+        entry, rest = user_model(slot, file), spec[len(file) + 1 :]
     else:
         name, _, rest = spec.partition(":")
         entry = model(slot, name)

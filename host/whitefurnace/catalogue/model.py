@@ -1,4 +1,5 @@
 """The form of catalogue entries: models with their parameters, checks and papers, and integrals."""
+
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -39,8 +40,9 @@ class Parameter:
             raise UsageError(f"{where}: {self.name} must be a number, not {values!r}") from None
         bad = ~((array >= self.low) & (array <= self.high))  # also catches NaN
         if bad.any():
-            raise UsageError(f"{where}: {self.name} = {array[bad].flat[0]:g} is outside "
-                             f"[{self.low:g}, {self.high:g}] ({self.about})")
+            raise UsageError(
+                f"{where}: {self.name} = {array[bad].flat[0]:g} is outside [{self.low:g}, {self.high:g}] ({self.about})"
+            )
         return array
 
 
@@ -80,8 +82,12 @@ class Checks:
 
 
 _LISTED = {
-    "normalized": (), "reciprocal": (), "slow rules": ("float32", "follows roughness"),
-    "weak furnace": ("follows roughness",), "tolerance": ("float32", "energy"), "largest albedo": ("energy",),
+    "normalized": (),
+    "reciprocal": (),
+    "slow rules": ("float32", "follows roughness"),
+    "weak furnace": ("follows roughness",),
+    "tolerance": ("float32", "energy"),
+    "largest albedo": ("energy",),
 }
 """The checks that a listing of a model shows, each after the first of these notes that the model has, or at the top."""
 

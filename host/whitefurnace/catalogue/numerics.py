@@ -1,4 +1,5 @@
 """Small float64 functions that several entries share."""
+
 import numpy as np
 
 

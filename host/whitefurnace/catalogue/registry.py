@@ -1,4 +1,5 @@
 """Finds the entries in their folders and gives them by name; lists the integrals."""
+
 from __future__ import annotations
 
 import importlib
@@ -35,31 +36,80 @@ def model(slot: str, name: str) -> Model:
 INTEGRALS = {
     entry.name: entry
     for entry in (
-        Integral("normalization", "NDF normalization", 1, ("NDF_D",), "ALL", False,
-                 "∫ D(m)(n·m) dω over the hemisphere; 1 for a normalized NDF, the raw norm of a user's"),
-        Integral("projected_area", "Projected area", 1, ("NDF_D",), "POLAR", True,
-                 "A(v) = ∫ D(m)(v·m)₊ dω"),
-        Integral("weak_furnace", "Weak white furnace", 1, ("NDF_D", "MASKING_G1"), "POLAR", True,
-                 "∫ D(m) G1(v)(v·m)₊ dω / (n·v); 1 where the masking fits the NDF"),
-        Integral("albedo", "Directional albedo", 1, ("NDF_D", "MASKING_V", "FRESNEL_F"), "HALF_ANGLE", True,
-                 "E(v) = ∫ f(l, v)(n·l) dω"),
-        Integral("albedo_average", "Average albedo", 1, ("NDF_D", "MASKING_V", "FRESNEL_F"), "HALF_ANGLE", False,
-                 "2 ∫ E(μ) μ dμ"),
-        Integral("dfg", "Split-sum pair", 2, ("NDF_D", "MASKING_V"), "HALF_ANGLE", True,
-                 "(A, B) with E(v; F0) = F0·A + B, Schlick's F with F90 = 1"),
-        Integral("radiance", "Reflected radiance", 1, ("NDF_D", "MASKING_V", "FRESNEL_F", "LIGHT_L"), "LIGHT", True,
-                 "L_o(v) = ∫ f(l, v) L(l)(n·l) dω of a light or an environment"),
+        Integral(
+            "normalization",
+            "NDF normalization",
+            1,
+            ("NDF_D",),
+            "ALL",
+            False,
+            "∫ D(m)(n·m) dω over the hemisphere; 1 for a normalized NDF, the raw norm of a user's",
+        ),
+        Integral("projected_area", "Projected area", 1, ("NDF_D",), "POLAR", True, "A(v) = ∫ D(m)(v·m)₊ dω"),
+        Integral(
+            "weak_furnace",
+            "Weak white furnace",
+            1,
+            ("NDF_D", "MASKING_G1"),
+            "POLAR",
+            True,
+            "∫ D(m) G1(v)(v·m)₊ dω / (n·v); 1 where the masking fits the NDF",
+        ),
+        Integral(
+            "albedo",
+            "Directional albedo",
+            1,
+            ("NDF_D", "MASKING_V", "FRESNEL_F"),
+            "HALF_ANGLE",
+            True,
+            "E(v) = ∫ f(l, v)(n·l) dω",
+        ),
+        Integral(
+            "albedo_average",
+            "Average albedo",
+            1,
+            ("NDF_D", "MASKING_V", "FRESNEL_F"),
+            "HALF_ANGLE",
+            False,
+            "2 ∫ E(μ) μ dμ",
+        ),
+        Integral(
+            "dfg",
+            "Split-sum pair",
+            2,
+            ("NDF_D", "MASKING_V"),
+            "HALF_ANGLE",
+            True,
+            "(A, B) with E(v; F0) = F0·A + B, Schlick's F with F90 = 1",
+        ),
+        Integral(
+            "radiance",
+            "Reflected radiance",
+            1,
+            ("NDF_D", "MASKING_V", "FRESNEL_F", "LIGHT_L"),
+            "LIGHT",
+            True,
+            "L_o(v) = ∫ f(l, v) L(l)(n·l) dω of a light or an environment",
+        ),
     )
 }
 
 CLOSED = {("dfg", "ggx", "smith"): "dfg_ggx.cl", ("dfg", "ggx", "smith_separable"): "dfg_ggx.cl"}
 """Integrals that have a kernel of their own for a pair of NDF and masking, by closed forms that others do not have."""
 
-LOBE = Integral("lobe", "The prefilter's lobe", 1, ("NDF_D",), "LOBE", False,
-                "∫ K dω of K(l·r) = D(h)(n·l) with n = v = r")
+LOBE = Integral(
+    "lobe", "The prefilter's lobe", 1, ("NDF_D",), "LOBE", False, "∫ K dω of K(l·r) = D(h)(n·l) with n = v = r"
+)
 
-REFRACTION = Integral("refraction", "Reflected and refracted", 2, ("NDF_D", "MASKING_V", "MASKING_G1", "FRESNEL_F"),
-                      "POLAR", True, "(R, T) of a rough boundary of two insulators, of what arrives along v")
+REFRACTION = Integral(
+    "refraction",
+    "Reflected and refracted",
+    2,
+    ("NDF_D", "MASKING_V", "MASKING_G1", "FRESNEL_F"),
+    "POLAR",
+    True,
+    "(R, T) of a rough boundary of two insulators, of what arrives along v",
+)
 
 
 def integral(name: str) -> Integral:

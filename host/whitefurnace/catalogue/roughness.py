@@ -5,6 +5,7 @@ one α share the peak 1/(πα²) and nothing more: with x = tan²θ/α² the one
 faster at first and far slower in the tail. Phong of n = 2/α² - 2 has the same peak, (n + 2)/(2π), and is Beckmann up to
 O(α²). [Walter2007, sec. 5.2]
 """
+
 from __future__ import annotations
 
 from typing import Any
@@ -14,8 +15,9 @@ import numpy as np
 from whitefurnace.catalogue.model import Parameter
 from whitefurnace.errors import UsageError
 
-ROUGHNESS = Parameter("roughness", "r", "1", 0.0, 1.0, (0.0, 0.1, 0.3, 0.5, 0.8, 1.0),
-                      "perceptual roughness, the root of α")
+ROUGHNESS = Parameter(
+    "roughness", "r", "1", 0.0, 1.0, (0.0, 0.1, 0.3, 0.5, 0.8, 1.0), "perceptual roughness, the root of α"
+)
 
 
 def _positive(values: Any, most: float, what: str) -> np.ndarray:

@@ -1,4 +1,5 @@
 """Quadrature rules: Gauss nodes on [0, 1], and the ladders of product rules that integrals climb."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -66,29 +67,114 @@ def _ladder(family: str, panels: int, *steps: tuple[int, int, int]) -> tuple[Rul
 # show in their difference. Each step costs about 1.5 times the one before.
 LADDERS = {
     # ring.clh: an NDF of the polar angle
-    "gauss": _ladder("gauss", 1, (10, 16, 8), (12, 24, 10), (16, 32, 12), (20, 36, 16), (24, 40, 18), (32, 48, 24),
-                     (40, 64, 26), (56, 88, 32), (80, 120, 48), (112, 168, 64), (160, 240, 96)),
+    "gauss": _ladder(
+        "gauss",
+        1,
+        (10, 16, 8),
+        (12, 24, 10),
+        (16, 32, 12),
+        (20, 36, 16),
+        (24, 40, 18),
+        (32, 48, 24),
+        (40, 64, 26),
+        (56, 88, 32),
+        (80, 120, 48),
+        (112, 168, 64),
+        (160, 240, 96),
+    ),
     # dfg_ggx.cl: three panels over the light's polar angle, an azimuth in closed form but for Schlick's part
-    "light-angles": _ladder("light-angles", 3, (0, 10, 9), (0, 12, 10), (0, 14, 11), (0, 18, 13), (0, 22, 16),
-                            (0, 28, 24), (0, 36, 36), (0, 48, 64)),
+    "light-angles": _ladder(
+        "light-angles",
+        3,
+        (0, 10, 9),
+        (0, 12, 10),
+        (0, 14, 11),
+        (0, 18, 13),
+        (0, 22, 16),
+        (0, 28, 24),
+        (0, 36, 36),
+        (0, 48, 64),
+    ),
     # glass.cl: three panels for what is reflected, four for what is refracted
-    "refraction": _ladder("refraction", 7, (0, 8, 8), (0, 10, 10), (0, 12, 14), (0, 16, 18), (0, 20, 24), (0, 28, 32),
-                          (0, 36, 40), (0, 48, 56), (0, 64, 72), (0, 96, 104), (0, 144, 144)),
+    "refraction": _ladder(
+        "refraction",
+        7,
+        (0, 8, 8),
+        (0, 10, 10),
+        (0, 12, 14),
+        (0, 16, 18),
+        (0, 20, 24),
+        (0, 28, 32),
+        (0, 36, 40),
+        (0, 48, 56),
+        (0, 64, 72),
+        (0, 96, 104),
+        (0, 144, 144),
+    ),
     # ring.clh without an azimuth: normalization
-    "polar": _ladder("polar", 1, (12, 12, 1), (16, 18, 1), (20, 24, 1), (28, 32, 1), (40, 44, 1), (56, 64, 1),
-                     (80, 88, 1), (112, 128, 1), (168, 192, 1), (256, 288, 1)),
+    "polar": _ladder(
+        "polar",
+        1,
+        (12, 12, 1),
+        (16, 18, 1),
+        (20, 24, 1),
+        (28, 32, 1),
+        (40, 44, 1),
+        (56, 64, 1),
+        (80, 88, 1),
+        (112, 128, 1),
+        (168, 192, 1),
+        (256, 288, 1),
+    ),
     # stretched.cl: anisotropic NDFs
-    "stretched": _ladder("stretched", 4, (0, 10, 5), (0, 14, 7), (0, 20, 10), (0, 28, 13), (0, 36, 18), (0, 48, 24),
-                         (0, 64, 32), (0, 88, 44), (0, 120, 64), (0, 168, 96)),
+    "stretched": _ladder(
+        "stretched",
+        4,
+        (0, 10, 5),
+        (0, 14, 7),
+        (0, 20, 10),
+        (0, 28, 13),
+        (0, 36, 18),
+        (0, 48, 24),
+        (0, 64, 32),
+        (0, 88, 44),
+        (0, 120, 64),
+        (0, 168, 96),
+    ),
     # hemisphere.cl: diffuse models, and BRDFs of whom nothing is known
-    "hemisphere": _ladder("hemisphere", 2, (8, 8, 6), (10, 12, 8), (14, 16, 10), (20, 24, 14), (28, 32, 18),
-                          (40, 44, 26), (56, 64, 36), (80, 88, 48), (112, 128, 64), (168, 192, 96)),
-    "half-vectors": _ladder("half-vectors", 4, (10, 16, 4), (14, 24, 6), (20, 32, 8), (28, 44, 12), (40, 64, 16),
-                            (56, 88, 24), (80, 120, 32), (112, 168, 48), (160, 240, 64)),
+    "hemisphere": _ladder(
+        "hemisphere",
+        2,
+        (8, 8, 6),
+        (10, 12, 8),
+        (14, 16, 10),
+        (20, 24, 14),
+        (28, 32, 18),
+        (40, 44, 26),
+        (56, 64, 36),
+        (80, 88, 48),
+        (112, 128, 64),
+        (168, 192, 96),
+    ),
+    "half-vectors": _ladder(
+        "half-vectors",
+        4,
+        (10, 16, 4),
+        (14, 24, 6),
+        (20, 32, 8),
+        (28, 44, 12),
+        (40, 64, 16),
+        (56, 88, 24),
+        (80, 120, 32),
+        (112, 168, 48),
+        (160, 240, 64),
+    ),
 }
 
-AREA_RULES = {32: (Rule("polar", 80, 120, 1), Rule("polar", 112, 168, 1)),
-              64: (Rule("polar", 160, 240, 1), Rule("polar", 224, 320, 1))}
+AREA_RULES = {
+    32: (Rule("polar", 80, 120, 1), Rule("polar", 112, 168, 1)),
+    64: (Rule("polar", 160, 240, 1), Rule("polar", 224, 320, 1)),
+}
 """The rules of Smith's tabulated area by precision: the second makes the table, the first tells its error."""
 
 AVERAGE_RULES = (12, 18, 26, 36, 52, 76)

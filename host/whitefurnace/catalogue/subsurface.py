@@ -2,6 +2,7 @@
 
 Lengths are in millimetres and coefficients per millimetre, as the papers have them.
 """
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -33,8 +34,14 @@ WATER = (0.340e-3, 0.0565e-3, 0.00922e-3)
 AIR = (5.8e-9, 13.5e-9, 33.1e-9)
 """Rayleigh scattering of air at sea level at 680, 550 and 440 nm. [Bruneton2008]"""
 
-SKIN = ((0.0064, (0.233, 0.455, 0.649)), (0.0484, (0.100, 0.336, 0.344)), (0.187, (0.118, 0.198, 0.0)),
-        (0.567, (0.113, 0.007, 0.007)), (1.99, (0.358, 0.004, 0.0)), (7.41, (0.078, 0.0, 0.0)))
+SKIN = (
+    (0.0064, (0.233, 0.455, 0.649)),
+    (0.0484, (0.100, 0.336, 0.344)),
+    (0.187, (0.118, 0.198, 0.0)),
+    (0.567, (0.113, 0.007, 0.007)),
+    (1.99, (0.358, 0.004, 0.0)),
+    (7.41, (0.078, 0.0, 0.0)),
+)
 """Skin as Gaussians: variances in mm² and weights in RGB, which sum to 1 in each. [dEonLuebke2007, table 14-1]"""
 
 
@@ -49,8 +56,9 @@ def diffuse_reflectance(scattering: Any, absorption: Any, ior: float) -> np.ndar
     # α' = 1/(1 + σa/σs'), which has a value where either is 0 or infinite; 0/0, which does nothing, reflects nothing.
     with np.errstate(divide="ignore", invalid="ignore"):
         reduced = np.where(scattering > 0, 1 / (1 + absorption / scattering), 0.0)
-        lost = np.where(scattering > 0, np.where(np.isinf(absorption), 1.0, absorption / (absorption + scattering)),
-                        1.0)
+        lost = np.where(
+            scattering > 0, np.where(np.isinf(absorption), 1.0, absorption / (absorption + scattering)), 1.0
+        )
     root, image = np.sqrt(3 * lost), _image(ior)
     return np.asarray(0.5 * reduced * (np.exp(-root) + np.exp(-image * root)))
 

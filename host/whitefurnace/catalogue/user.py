@@ -1,4 +1,5 @@
 """Models from a user's `.clh` file: an NDF with only D in it, or a whole BRDF."""
+
 from __future__ import annotations
 
 import re
@@ -53,12 +54,15 @@ def user_model(slot: str, path: str | Path) -> Model:
     takes_sin2 = slot == "ndf" and len(signature) > 1 and signature[1] == ("real", "sin2_m")
     count = len(own) + takes_sin2
     rest = signature[count:]
-    if [kind for kind, _ in signature[:len(own)]] != [kind for kind, _ in own] or any(k != "real" for k, _ in rest):
+    if [kind for kind, _ in signature[: len(own)]] != [kind for kind, _ in own] or any(k != "real" for k, _ in rest):
         raise InputError(f"{path}: {name} takes ({found[1].strip()}); needed is {wanted}")
     names = [name for _, name in rest]
     for name in names:
-        if name in CONSTANTS or names.count(name) > 1 or name in ("area_scale", "area_per_range", "area_grazing",
-                                                                  "area_terms"):
+        if (
+            name in CONSTANTS
+            or names.count(name) > 1
+            or name in ("area_scale", "area_per_range", "area_grazing", "area_terms")
+        ):
             raise InputError(f"{path}: parameter {name!r} of the function is taken; give it another name")
     return Model(
         slot=slot,

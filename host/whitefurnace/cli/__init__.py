@@ -3,6 +3,7 @@
 Each module of this package that defines a command of its own name is a command: a new command is a new file. Commands
 import numpy, OpenCL and image libraries when they run, so that `--help` is quick.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -19,9 +20,12 @@ from whitefurnace.cli.terminal import print_row, say
 from whitefurnace.errors import WhitefurnaceError
 
 
-@click.group(cls=Group, invoke_without_command=True,
-             context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
-             epilog="`whitefurnace COMMAND --help` shows the options and examples of a command.")
+@click.group(
+    cls=Group,
+    invoke_without_command=True,
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110},
+    epilog="`whitefurnace COMMAND --help` shows the options and examples of a command.",
+)
 @click.version_option(package_name="whitefurnace")
 @click.pass_context
 def cli(context: click.Context) -> None:

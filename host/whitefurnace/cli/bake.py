@@ -1,4 +1,5 @@
 """`whitefurnace bake`: its options, what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 import math
@@ -33,58 +34,143 @@ OUTPUT, ACCURACY, ENVIRONMENT, LIGHT = "Output", "Accuracy", "Environment", "Sun
 @options.command("Bake and tabulate", "Bake environments into the textures that engines load", EPILOG)
 @click.argument("environments", metavar="ENV...", nargs=-1, required=True)
 @options.output_folder("Folder that the files are written to.", required=True)
-@options.option("--for", "for_", metavar="LIST", default="raw", show_default=True, heading=OUTPUT,
-                help="Target engines, separated by commas: names from `whitefurnace engines`, raw (.npz), exr (strips "
-                     "and lat-longs), or a FILE.toml that describes your own.")
-@options.option("--size", metavar="N", type=int, heading=OUTPUT,
-                help="Edge of a cube face of the first level in texels, a power of two from 1 to 2048. [default: 256, "
-                     "or the engine's]")
-@options.option("--min-size", metavar="N", type=int, heading=OUTPUT,
-                help="Edge of a cube face of the last level in texels, a power of two up to --size. [default: 16, or "
-                     "the engine's]")
-@options.option("--levels", metavar="N", type=int, heading=OUTPUT,
-                help="Number of levels, at most as many as halving gives from --size down to 1 texel. Levels past "
-                     "--min-size keep that size.")
-@options.option("--only-levels", metavar="A-B", heading=OUTPUT,
-                help="Make only the levels A to B, counted from 0. For raw and exr.")
-@options.option("--without", metavar="LIST", default="", heading=OUTPUT,
-                help="Leave out parts that no material reads, separated by commas: irradiance, sh, sheen, dfg, skybox. "
-                     "`whitefurnace scene` lists which parts a scene needs.")
-@options.option("--table", metavar="N", type=int, heading=OUTPUT,
-                help="Texels along each side of the engines' split-sum tables, 1 to 4096. [default: the engine's]")
+@options.option(
+    "--for",
+    "for_",
+    metavar="LIST",
+    default="raw",
+    show_default=True,
+    heading=OUTPUT,
+    help="Target engines, separated by commas: names from `whitefurnace engines`, raw (.npz), exr (strips "
+    "and lat-longs), or a FILE.toml that describes your own.",
+)
+@options.option(
+    "--size",
+    metavar="N",
+    type=int,
+    heading=OUTPUT,
+    help="Edge of a cube face of the first level in texels, a power of two from 1 to 2048. [default: 256, "
+    "or the engine's]",
+)
+@options.option(
+    "--min-size",
+    metavar="N",
+    type=int,
+    heading=OUTPUT,
+    help="Edge of a cube face of the last level in texels, a power of two up to --size. [default: 16, or the engine's]",
+)
+@options.option(
+    "--levels",
+    metavar="N",
+    type=int,
+    heading=OUTPUT,
+    help="Number of levels, at most as many as halving gives from --size down to 1 texel. Levels past "
+    "--min-size keep that size.",
+)
+@options.option(
+    "--only-levels", metavar="A-B", heading=OUTPUT, help="Make only the levels A to B, counted from 0. For raw and exr."
+)
+@options.option(
+    "--without",
+    metavar="LIST",
+    default="",
+    heading=OUTPUT,
+    help="Leave out parts that no material reads, separated by commas: irradiance, sh, sheen, dfg, skybox. "
+    "`whitefurnace scene` lists which parts a scene needs.",
+)
+@options.option(
+    "--table",
+    metavar="N",
+    type=int,
+    heading=OUTPUT,
+    help="Texels along each side of the engines' split-sum tables, 1 to 4096. [default: the engine's]",
+)
 @options.ndf("Only isotropic ones can be prefiltered.", default="ggx", heading=OUTPUT)
-@options.tolerance("Largest error that the levels may have, 1e-5 to 0.5: a bound on the 99th percentile of the texels' "
-                   "relative errors. [default: 1e-3]")
-@options.option("--quality", metavar="NAME", heading=ACCURACY,
-                help="A named tolerance in place of --tolerance: draft (1e-2), normal (1e-3) or reference (2e-5).")
-@options.option("--samples", metavar="N", type=int, heading=ACCURACY,
-                help="Use filtered importance sampling with N samples per texel, 1 to 65536, in place of the exact "
-                     "sums. The error is measured and stated, not bounded.")
-@options.certify("Texels per level whose error is measured against the exact integral, 299 to 1048576. More texels "
-                 "give a tighter bound.", default=299)
-@options.option("--fit", metavar="read", heading=ACCURACY,
-                help="With `read`, fit the levels so that interpolated roughness values are most accurate. By default "
-                     "each level holds its own lobe.")
+@options.tolerance(
+    "Largest error that the levels may have, 1e-5 to 0.5: a bound on the 99th percentile of the texels' "
+    "relative errors. [default: 1e-3]"
+)
+@options.option(
+    "--quality",
+    metavar="NAME",
+    heading=ACCURACY,
+    help="A named tolerance in place of --tolerance: draft (1e-2), normal (1e-3) or reference (2e-5).",
+)
+@options.option(
+    "--samples",
+    metavar="N",
+    type=int,
+    heading=ACCURACY,
+    help="Use filtered importance sampling with N samples per texel, 1 to 65536, in place of the exact "
+    "sums. The error is measured and stated, not bounded.",
+)
+@options.certify(
+    "Texels per level whose error is measured against the exact integral, 299 to 1048576. More texels "
+    "give a tighter bound.",
+    default=299,
+)
+@options.option(
+    "--fit",
+    metavar="read",
+    heading=ACCURACY,
+    help="With `read`, fit the levels so that interpolated roughness values are most accurate. By default "
+    "each level holds its own lobe.",
+)
 @options.as_read("Also measure the total error after the engine's sampling. --fit and --dry-run always do.")
 @options.rotate(ENVIRONMENT)
 @options.exposure(ENVIRONMENT)
 @options.nonfinite(ENVIRONMENT)
-@options.option("--sun", metavar="keep|extract|clamp=X", default="keep", show_default=True, heading=LIGHT,
-                help="Keep the sun in the image, extract it as a directional light, or limit every texel to X times "
-                     "the mean radiance (X at least 1).")
-@options.option("--sh", metavar="window=auto|none|X", default="window=auto", show_default=True, heading=LIGHT,
-                help="Window of the engines' irradiance harmonics: the weakest that keeps them from going negative, "
-                     "none, or sinc⁴ with its cutoff at degree X, 1 to 1024.")
+@options.option(
+    "--sun",
+    metavar="keep|extract|clamp=X",
+    default="keep",
+    show_default=True,
+    heading=LIGHT,
+    help="Keep the sun in the image, extract it as a directional light, or limit every texel to X times "
+    "the mean radiance (X at least 1).",
+)
+@options.option(
+    "--sh",
+    metavar="window=auto|none|X",
+    default="window=auto",
+    show_default=True,
+    heading=LIGHT,
+    help="Window of the engines' irradiance harmonics: the weakest that keeps them from going negative, "
+    "none, or sinc⁴ with its cutoff at degree X, 1 to 1024.",
+)
 @options.device()
 @options.dry_run()
 @options.force()
 @options.as_json()
 @options.quiet()
-def bake(environments: tuple[str, ...], output: Path, for_: str, size: int | None, min_size: int | None,
-         levels: int | None, only_levels: str | None, without: str, table: int | None, ndf: str,
-         tolerance: float | None, quality: str | None, samples: int | None, certify: int, fit: str | None,
-         as_read: bool, rotate: float, exposure: float, nonfinite: str, sun: str, sh: str, device: str | None,
-         dry_run: bool, force: bool, as_json: bool, quiet: bool) -> None:
+def bake(
+    environments: tuple[str, ...],
+    output: Path,
+    for_: str,
+    size: int | None,
+    min_size: int | None,
+    levels: int | None,
+    only_levels: str | None,
+    without: str,
+    table: int | None,
+    ndf: str,
+    tolerance: float | None,
+    quality: str | None,
+    samples: int | None,
+    certify: int,
+    fit: str | None,
+    as_read: bool,
+    rotate: float,
+    exposure: float,
+    nonfinite: str,
+    sun: str,
+    sh: str,
+    device: str | None,
+    dry_run: bool,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """Bake environments into the files that engines load: the prefiltered specular chain, irradiance, spherical
     harmonics and the DFG table, each with its error.
 
@@ -94,10 +180,32 @@ def bake(environments: tuple[str, ...], output: Path, for_: str, size: int | Non
     from whitefurnace.baking import bake as baking
     from whitefurnace.baking.request import BakeRequest
 
-    planned = baking.plan(BakeRequest(
-        environments, output, for_=for_, size=size, min_size=min_size, levels=levels, only_levels=only_levels,
-        without=without, table=table, ndf=ndf, tolerance=tolerance, quality=quality, samples=samples, certify=certify,
-        fit=fit, as_read=as_read, rotate=rotate, exposure=exposure, nonfinite=nonfinite, sun=sun, sh=sh, force=force))
+    planned = baking.plan(
+        BakeRequest(
+            environments,
+            output,
+            for_=for_,
+            size=size,
+            min_size=min_size,
+            levels=levels,
+            only_levels=only_levels,
+            without=without,
+            table=table,
+            ndf=ndf,
+            tolerance=tolerance,
+            quality=quality,
+            samples=samples,
+            certify=certify,
+            fit=fit,
+            as_read=as_read,
+            rotate=rotate,
+            exposure=exposure,
+            nonfinite=nonfinite,
+            sun=sun,
+            sh=sh,
+            force=force,
+        )
+    )
     failures: list[WhitefurnaceError] = []
     with progress(not (quiet or as_json)) as report:
         for k, name in enumerate(planned.names):
@@ -114,7 +222,8 @@ def bake(environments: tuple[str, ...], output: Path, for_: str, size: int | Non
     if failures:
         alike = len({type(error) for error in failures}) == 1 and len(failures) == len(planned.names)
         raise (type(failures[0]) if alike else PartialError)(
-            f"{len(failures)} of {len(planned.names)} environments failed")
+            f"{len(failures)} of {len(planned.names)} environments failed"
+        )
 
 
 def _print_failure(name: str, error: WhitefurnaceError, as_json: bool) -> None:
@@ -150,15 +259,45 @@ def baked_text(baked: Baked, output: Path) -> str:
         # Level 0 is the image itself, whatever the lobe.
         counts[name] = counts.get(name, 0 if name == "sheen" else _first(m) - 1) + 1
         what = f"{name} of {', '.join(row['for'])}" if several else f"{name} {counts[name]}"
-        rows.append([what, f"{row['size']}²", f"{row['roughness']:.3f}", f"{row['error']:.1e}",
-                     f"{row['worst']:.1e}", f"{row['rmse']:.1e}", row["method"], f"{row['seconds']:.2f} s"])
+        rows.append(
+            [
+                what,
+                f"{row['size']}²",
+                f"{row['roughness']:.3f}",
+                f"{row['error']:.1e}",
+                f"{row['worst']:.1e}",
+                f"{row['rmse']:.1e}",
+                row["method"],
+                f"{row['seconds']:.2f} s",
+            ]
+        )
     wide = m.get("latlong_levels", [])
     for k, row in enumerate(wide, _first(m)):
-        rows.append([f"lat-long {k}", f"{row['size']}×{row['size'] // 2}", f"{row['roughness']:.3f}",
-                     f"{row['error']:.1e}", f"{row['worst']:.1e}", f"{row['rmse']:.1e}", row["method"], ""])
+        rows.append(
+            [
+                f"lat-long {k}",
+                f"{row['size']}×{row['size'] // 2}",
+                f"{row['roughness']:.3f}",
+                f"{row['error']:.1e}",
+                f"{row['worst']:.1e}",
+                f"{row['rmse']:.1e}",
+                row["method"],
+                "",
+            ]
+        )
     e = m["irradiance"]
-    rows.append(["irradiance", f"{e['size']}²", "", f"{e['error']:.1e}", f"{e['worst']:.1e}", f"{e['rmse']:.1e}",
-                 e["method"], ""])
+    rows.append(
+        [
+            "irradiance",
+            f"{e['size']}²",
+            "",
+            f"{e['error']:.1e}",
+            f"{e['worst']:.1e}",
+            f"{e['rmse']:.1e}",
+            e["method"],
+            "",
+        ]
+    )
     rows.append(["irradiance SH", "9×3", "", f"{m['sh']['error']:.1e}", "", "", "texel-nodes", ""])
     d = m["dfg"]
     rows.append(["DFG", f"{d['size']}²", "", f"{d['error']:.1e}", "", "", d["rule"], ""])
@@ -168,9 +307,11 @@ def baked_text(baked: Baked, output: Path) -> str:
         towards = ", ".join(f"{x:.4f}" for x in sun["direction"])
         rows.append(["sun", f"{math.degrees(2 * sun['angular_radius']):.2f}°", "", "", "", "", "extracted", ""])
     s = m["source"]["statistics"]
-    lines = [f"{baked.name}: {m['source']['layout']} {s['width']}×{s['height']}, brightest texel "
-             f"{s['max_over_mean']:.3g} × the mean, on {m['device']['name']} ({m['device']['platform']})",
-             table(["", "size", "r", "error", "worst", "rmse", "method", "time"], rows)]
+    lines = [
+        f"{baked.name}: {m['source']['layout']} {s['width']}×{s['height']}, brightest texel "
+        f"{s['max_over_mean']:.3g} × the mean, on {m['device']['name']} ({m['device']['platform']})",
+        table(["", "size", "r", "error", "worst", "rmse", "method", "time"], rows),
+    ]
     if "sun" in m:
         lines.append(f"  sun: direction ({towards}), irradiance facing it ({triple}), π times the light colour c")
     lines += as_read_lines(baked.as_read)
@@ -208,17 +349,28 @@ def _first(manifest: Mapping[str, Any]) -> int:
 def planned_text(baked: Baked) -> str:
     """The text of a planned bake: levels, files, and the kernel programs it would compile."""
     several = len({names for names, _ in baked.plan}) > 1
-    rows = [[f"specular of {', '.join(names)}" if several else f"specular {k}", f"{p.size}²", f"{p.roughness:.3f}",
-             f"{p.grid}²" if p.grid else f"{p.samples} samples" if p.samples else "texel mean", f"{p.pairs:.2g}",
-             f"{p.cuts}×{p.cuts}"] for k, (names, p) in enumerate(baked.plan, _first(baked.manifest))]
-    lines = [f"{baked.name}: would bake, key {baked.manifest['key'][:12]}…",
-             table(["", "size", "r", "source grid a face", "lobe evaluations", "nodes a texel"], rows)]
+    rows = [
+        [
+            f"specular of {', '.join(names)}" if several else f"specular {k}",
+            f"{p.size}²",
+            f"{p.roughness:.3f}",
+            f"{p.grid}²" if p.grid else f"{p.samples} samples" if p.samples else "texel mean",
+            f"{p.pairs:.2g}",
+            f"{p.cuts}×{p.cuts}",
+        ]
+        for k, (names, p) in enumerate(baked.plan, _first(baked.manifest))
+    ]
+    lines = [
+        f"{baked.name}: would bake, key {baked.manifest['key'][:12]}…",
+        table(["", "size", "r", "source grid a face", "lobe evaluations", "nodes a texel"], rows),
+    ]
     for path, nbytes in zip(baked.files, baked.nbytes, strict=True):
         lines.append(f"  would write {path}  {size(nbytes)} before compression")
     if baked.programs:
         text = size(sum(program.nbytes for program in baked.programs))
         lines.append(f"  would compile {len(baked.programs)} kernel programs of {text} of text; --json has it")
     return "\n".join([*lines, *as_read_lines(baked.as_read)])
+
 
 AS_READ = ("between", "texels", "levels", "format", "all")
 
@@ -229,36 +381,70 @@ def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
         return []
     parts = [part for part in AS_READ if any(part in read["parts"] for read in found)]
     several = len({read.get("for") for read in found}) > 1
-    rows = [[read["for"] if several else "", str(read["levels"]), f"{read['sizes'][-1]}²", read["fit"] or "own lobe",
-             *(f"{read['parts'][part]['mean']:.2g}" if part in read["parts"] else "" for part in parts),
-             f"{read['parts']['all' if 'all' in read['parts'] else 'between']['p95']:.2g}"] for read in found]
+    rows = [
+        [
+            read["for"] if several else "",
+            str(read["levels"]),
+            f"{read['sizes'][-1]}²",
+            read["fit"] or "own lobe",
+            *(f"{read['parts'][part]['mean']:.2g}" if part in read["parts"] else "" for part in parts),
+            f"{read['parts']['all' if 'all' in read['parts'] else 'between']['p95']:.2g}",
+        ]
+        for read in found
+    ]
     formats = ", ".join(dict.fromkeys(read["format"] for read in found))
     head = ["for", "levels", "last", "fit"]
     if not several:
         rows, head = [row[1:] for row in rows], head[1:]
-    return [f"  as read from {formats}: error of what engines show, mean over r of the RMS over directions",
-            table([*head, *parts, "p95"], rows, left=len(head))]
+    return [
+        f"  as read from {formats}: error of what engines show, mean over r of the RMS over directions",
+        table([*head, *parts, "p95"], rows, left=len(head)),
+    ]
 
 
 def baked_rows(baked: Baked) -> list[dict[str, Any]]:
     """JSON rows of a bake: one for each level, then one for the whole."""
     rows: list[dict[str, Any]] = []
     if baked.state == "planned":
-        rows += [{"event": "level", "name": baked.name, "level": k, "for": list(names), "size": p.size,
-                  "roughness": p.roughness, "grid": p.grid, "samples": p.samples, "pairs": p.pairs, "cuts": p.cuts}
-                 for k, (names, p) in enumerate(baked.plan, _first(baked.manifest))]
+        rows += [
+            {
+                "event": "level",
+                "name": baked.name,
+                "level": k,
+                "for": list(names),
+                "size": p.size,
+                "roughness": p.roughness,
+                "grid": p.grid,
+                "samples": p.samples,
+                "pairs": p.pairs,
+                "cuts": p.cuts,
+            }
+            for k, (names, p) in enumerate(baked.plan, _first(baked.manifest))
+        ]
         rows += [{"event": "kernel", "name": baked.name, **program.data()} for program in baked.programs]
     else:
-        rows += [{"event": "level", "name": baked.name, "level": k, **row}
-                 for k, row in enumerate(baked.levels, _first(baked.manifest))]
+        rows += [
+            {"event": "level", "name": baked.name, "level": k, **row}
+            for k, row in enumerate(baked.levels, _first(baked.manifest))
+        ]
     rows += [{"event": "as_read", "name": baked.name, **read} for read in baked.as_read]
     m = baked.manifest
-    whole: dict[str, Any] = {"event": baked.state, "name": baked.name, "key": m["key"], "seconds": baked.seconds,
-                             "notices": list(baked.notices)}
+    whole: dict[str, Any] = {
+        "event": baked.state,
+        "name": baked.name,
+        "key": m["key"],
+        "seconds": baked.seconds,
+        "notices": list(baked.notices),
+    }
     if baked.state == "planned":
         whole |= {"recipe": m["recipe"], "files": {str(p): n for p, n in zip(baked.files, baked.nbytes, strict=True)}}
     else:
         whole |= {"sun": m["sun"]} if "sun" in m else {}
-        whole |= {"files": m["files"], "device": m["device"], "irradiance": m["irradiance"], "dfg": m["dfg"],
-                  "sh": m["sh"]}
+        whole |= {
+            "files": m["files"],
+            "device": m["device"],
+            "irradiance": m["irradiance"],
+            "dfg": m["dfg"],
+            "sh": m["sh"],
+        }
     return [*rows, whole]

@@ -1,4 +1,5 @@
 """`whitefurnace batch`: its options, what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 import contextlib
@@ -41,31 +42,84 @@ OUTPUT, WORK = "Output", "Division of the work"
 
 @options.command("Scenes and batches", "Run the bakes and tables of a job file, each once", EPILOG)
 @click.argument("job", type=options.FilePath)
-@options.option("-o", "--output", "root", metavar="DIR", type=options.FilePath, heading=OUTPUT,
-                help="Folder that all outputs must lie in. [default: the folder of JOB]")
-@options.option("--report", "page", metavar="DIR", type=options.FilePath, heading=OUTPUT,
-                help="Write DIR/index.html: for each item its levels as pictures, errors, time and size.")
-@options.option("--depfile", metavar="FILE", type=options.FilePath, heading=OUTPUT,
-                help="Write Makefile rules that name each output and the files it was made from.")
-@options.option("--workers", metavar="N", type=int, default=1, show_default=True, heading=WORK,
-                help="Number of processes on this machine, 1 to 1024. They share the cores of the device.")
-@options.option("--scheduler", metavar="tcp://HOST:PORT", heading=WORK,
-                help="Run on a Dask cluster whose workers declare the resource OPENCL and see the same folders. Needs "
-                     "Dask.")
-@options.option("--send", is_flag=True, heading=WORK,
-                help="Send the source images to the cluster, so that workers need not see their folders.")
-@options.option("--shard", metavar="I/N", heading=WORK,
-                help="Run only every N-th item, beginning with the I-th, 1 to N. The N shards make the whole job.")
-@options.option("--allow-kernels", is_flag=True, heading=WORK,
-                help="Allow the job to name .clh files. Their code runs on the device.")
+@options.option(
+    "-o",
+    "--output",
+    "root",
+    metavar="DIR",
+    type=options.FilePath,
+    heading=OUTPUT,
+    help="Folder that all outputs must lie in. [default: the folder of JOB]",
+)
+@options.option(
+    "--report",
+    "page",
+    metavar="DIR",
+    type=options.FilePath,
+    heading=OUTPUT,
+    help="Write DIR/index.html: for each item its levels as pictures, errors, time and size.",
+)
+@options.option(
+    "--depfile",
+    metavar="FILE",
+    type=options.FilePath,
+    heading=OUTPUT,
+    help="Write Makefile rules that name each output and the files it was made from.",
+)
+@options.option(
+    "--workers",
+    metavar="N",
+    type=int,
+    default=1,
+    show_default=True,
+    heading=WORK,
+    help="Number of processes on this machine, 1 to 1024. They share the cores of the device.",
+)
+@options.option(
+    "--scheduler",
+    metavar="tcp://HOST:PORT",
+    heading=WORK,
+    help="Run on a Dask cluster whose workers declare the resource OPENCL and see the same folders. Needs Dask.",
+)
+@options.option(
+    "--send",
+    is_flag=True,
+    heading=WORK,
+    help="Send the source images to the cluster, so that workers need not see their folders.",
+)
+@options.option(
+    "--shard",
+    metavar="I/N",
+    heading=WORK,
+    help="Run only every N-th item, beginning with the I-th, 1 to N. The N shards make the whole job.",
+)
+@options.option(
+    "--allow-kernels",
+    is_flag=True,
+    heading=WORK,
+    help="Allow the job to name .clh files. Their code runs on the device.",
+)
 @options.device()
 @options.dry_run()
 @options.force()
 @options.as_json()
 @options.quiet("Print failures only.")
-def batch(job: Path, root: Path | None, page: Path | None, depfile: Path | None, workers: int, scheduler: str | None,
-          send: bool, shard: str | None, allow_kernels: bool, device: str | None, dry_run: bool, force: bool,
-          as_json: bool, quiet: bool) -> None:
+def batch(
+    job: Path,
+    root: Path | None,
+    page: Path | None,
+    depfile: Path | None,
+    workers: int,
+    scheduler: str | None,
+    send: bool,
+    shard: str | None,
+    allow_kernels: bool,
+    device: str | None,
+    dry_run: bool,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """Run many bakes and tables that a job file lists. Outputs that are up to date are skipped."""
     from whitefurnace import errors
     from whitefurnace.batch import jobs as batching
@@ -92,13 +146,19 @@ def batch(job: Path, root: Path | None, page: Path | None, depfile: Path | None,
         else:
             written = print_row if as_json else None if quiet else lambda row: click.echo(f"report: {row['file']}")
             with _page(page, job.name, force, summary, written) as add, _bar(summary, not (quiet or as_json)) as show:
+
                 def on_result(result: Result) -> None:
                     report(result)
                     add(result)
                     show()
 
-                batching.run(made, workers=workers, scheduler=scheduler, on_result=on_result,
-                             on_notice=None if quiet else lambda text: say(f"notice: {text}"))
+                batching.run(
+                    made,
+                    workers=workers,
+                    scheduler=scheduler,
+                    on_result=on_result,
+                    on_notice=None if quiet else lambda text: say(f"notice: {text}"),
+                )
         if depfile is not None and not dry_run:
             batching.depfile(made, results, depfile)
     finally:
@@ -131,8 +191,9 @@ def _print_summary(summary: Summary, as_json: bool, quiet: bool) -> None:
 
 
 @contextlib.contextmanager
-def _page(folder: Path | None, title: str, force: bool, summary: Summary,
-          written: Callable[[Mapping[str, Any]], None] | None) -> Iterator[Callable[[Any], None]]:
+def _page(
+    folder: Path | None, title: str, force: bool, summary: Summary, written: Callable[[Mapping[str, Any]], None] | None
+) -> Iterator[Callable[[Any], None]]:
     """The HTML page of a batch: gives a function that adds an item. The page is written also when the batch is stopped.
     `written` is called with a row that names the page."""
     if folder is None:
@@ -167,8 +228,13 @@ def _bar(summary: Summary, wanted: bool) -> Iterator[Callable[[], None]]:
 
 def result_row(result: Result) -> dict[str, Any]:
     """The JSON row of an item of a batch."""
-    row: dict[str, Any] = {"event": result.state, "kind": result.kind, "place": result.place, "name": result.name,
-                           "output": result.output}
+    row: dict[str, Any] = {
+        "event": result.state,
+        "kind": result.kind,
+        "place": result.place,
+        "name": result.name,
+        "output": result.output,
+    }
     if result.state == "failed":
         return {**row, "message": result.message, "exit_code": result.exit_code}
     row |= {"manifest": result.manifest, "files": result.files, "bytes": result.nbytes}
@@ -183,11 +249,19 @@ def result_text(result: Result) -> str:
         error = "" if result.error is None else f", error {result.error:.1e}"
         return f"{result.place}: {size(result.nbytes)}{error}, {sum(result.seconds.values()):.2f} s"
     if result.state == "planned":
-        about = f"; about {result.predicted['cpu_seconds']:.2g} s of processor time and " \
-                f"{size(result.predicted['memory'])} of memory" if result.predicted else ""
-        return "\n".join([f"{result.place}: {len(result.files)} file{'s' if len(result.files) > 1 else ''}, "
-                          f"{size(result.nbytes)} before compression{about}",
-                          *(f"  would write {path}  {size(nbytes)}" for path, nbytes in result.files.items())])
+        about = (
+            f"; about {result.predicted['cpu_seconds']:.2g} s of processor time and "
+            f"{size(result.predicted['memory'])} of memory"
+            if result.predicted
+            else ""
+        )
+        return "\n".join(
+            [
+                f"{result.place}: {len(result.files)} file{'s' if len(result.files) > 1 else ''}, "
+                f"{size(result.nbytes)} before compression{about}",
+                *(f"  would write {path}  {size(nbytes)}" for path, nbytes in result.files.items()),
+            ]
+        )
     return ""
 
 
@@ -212,14 +286,23 @@ def summary_text(summary: Summary) -> str:
     counts += [f"{left} not begun"] if left else []
     line = f"{summary.total} items: {', '.join(counts) or 'none'}; {size(summary.nbytes)}"
     if summary.states["planned"]:
-        return line + f", about {summary.predicted['cpu_seconds']:.2g} s of processor time, " \
-                      f"{size(summary.predicted['memory'])} of memory a worker"
+        return (
+            line + f", about {summary.predicted['cpu_seconds']:.2g} s of processor time, "
+            f"{size(summary.predicted['memory'])} of memory a worker"
+        )
     stages = ", ".join(f"{name} {seconds:.2f}" for name, seconds in summary.seconds.items())
     return line + f", {summary.wall:.2f} s ({stages})"
 
 
 def summary_row(summary: Summary) -> dict[str, Any]:
     """The JSON row of the summary, with every failure."""
-    return {"event": "summary", "items": summary.total, **summary.states, "bytes": summary.nbytes, "wall": summary.wall,
-            "seconds": summary.seconds, **({"predicted": summary.predicted} if summary.states["planned"] else {}),
-            "failures": [{"place": r.place, "message": r.message, "exit_code": r.exit_code} for r in summary.failed]}
+    return {
+        "event": "summary",
+        "items": summary.total,
+        **summary.states,
+        "bytes": summary.nbytes,
+        "wall": summary.wall,
+        "seconds": summary.seconds,
+        **({"predicted": summary.predicted} if summary.states["planned"] else {}),
+        "failures": [{"place": r.place, "message": r.message, "exit_code": r.exit_code} for r in summary.failed],
+    }

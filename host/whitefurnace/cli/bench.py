@@ -1,4 +1,5 @@
 """`whitefurnace bench`: its options, what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -40,19 +41,48 @@ MEASUREMENT, TRADEOFF = "Measurement", "Of tradeoff"
 
 @options.command("Prove and measure", "Measure the speed of kernels, or error against time", EPILOG)
 @click.argument("words", metavar="[CASE...|tradeoff ENV...]", nargs=-1)
-@options.option("--runs", metavar="N", type=int, heading=MEASUREMENT,
-                help="Timed runs of each case, 1 to 1000. [default: 7; for tradeoff at most 5 within 3 s]")
-@options.option("--size", metavar="N", type=int, heading=TRADEOFF,
-                help="Edge of a cube face of the first level in texels, a power of two. [default: 256]")
-@options.option("--min-size", metavar="N", type=int, heading=TRADEOFF,
-                help="Edge of a cube face of the last level in texels, a power of two. [default: 16]")
-@options.option("--plot", "folder", metavar="DIR", type=options.FilePath, heading=TRADEOFF,
-                help="Draw tradeoff.png into the folder DIR. Needs matplotlib.")
+@options.option(
+    "--runs",
+    metavar="N",
+    type=int,
+    heading=MEASUREMENT,
+    help="Timed runs of each case, 1 to 1000. [default: 7; for tradeoff at most 5 within 3 s]",
+)
+@options.option(
+    "--size",
+    metavar="N",
+    type=int,
+    heading=TRADEOFF,
+    help="Edge of a cube face of the first level in texels, a power of two. [default: 256]",
+)
+@options.option(
+    "--min-size",
+    metavar="N",
+    type=int,
+    heading=TRADEOFF,
+    help="Edge of a cube face of the last level in texels, a power of two. [default: 16]",
+)
+@options.option(
+    "--plot",
+    "folder",
+    metavar="DIR",
+    type=options.FilePath,
+    heading=TRADEOFF,
+    help="Draw tradeoff.png into the folder DIR. Needs matplotlib.",
+)
 @options.device()
 @options.dry_run("Print what would be measured, and do nothing.")
 @options.as_json()
-def bench(words: tuple[str, ...], runs: int | None, size: int | None, min_size: int | None, folder: Path | None,
-          device: str | None, dry_run: bool, as_json: bool) -> None:
+def bench(
+    words: tuple[str, ...],
+    runs: int | None,
+    size: int | None,
+    min_size: int | None,
+    folder: Path | None,
+    device: str | None,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
     """Measure kernels against the limits of the device, or the error of prefiltering against its time.
 
     Without a CASE all kernels are measured; --dry-run lists them. ENV is any environment that `bake` takes.
@@ -63,8 +93,16 @@ def bench(words: tuple[str, ...], runs: int | None, size: int | None, min_size: 
     if runs is not None and not 1 <= runs <= 1000:
         raise UsageError(f"runs {runs} is outside [1, 1000]")
     if words and words[0] == "tradeoff":
-        _tradeoff(words[1:], 256 if size is None else size, 16 if min_size is None else min_size, runs, folder, device,
-                  dry_run, as_json)
+        _tradeoff(
+            words[1:],
+            256 if size is None else size,
+            16 if min_size is None else min_size,
+            runs,
+            folder,
+            device,
+            dry_run,
+            as_json,
+        )
         return
     for name, given in (("--size", size), ("--min-size", min_size), ("--plot", folder)):
         if given is not None:
@@ -91,8 +129,16 @@ def bench(words: tuple[str, ...], runs: int | None, size: int | None, min_size: 
         click.echo(bench_text(rows, yardstick, f"{identity['name']} ({identity['platform']})"))
 
 
-def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | None, folder: Path | None,
-              device: str | None, dry_run: bool, as_json: bool) -> None:
+def _tradeoff(
+    sources: tuple[str, ...],
+    size: int,
+    min_size: int,
+    runs: int | None,
+    folder: Path | None,
+    device: str | None,
+    dry_run: bool,
+    as_json: bool,
+) -> None:
     """Measure error against time on every environment, and on the first one the cost of sizes and roughness."""
     from whitefurnace.benching import tradeoff
     from whitefurnace.opencl.device import choose_device
@@ -115,8 +161,11 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
     with progress(not as_json) as report:
         for source in sources:
             env = tradeoff.load(source, on)
-            found = list(tradeoff.points(env, on, size=size, min_size=min_size, runs=runs or tradeoff.RUNS,
-                                         progress=of_one(report, env.name)))
+            found = list(
+                tradeoff.points(
+                    env, on, size=size, min_size=min_size, runs=runs or tradeoff.RUNS, progress=of_one(report, env.name)
+                )
+            )
             own = tradeoff.with_front([p for p in found if isinstance(p, tradeoff.Point)])
             missed = [p for p in found if isinstance(p, tradeoff.Missed)]
             points += own
@@ -125,8 +174,16 @@ def _tradeoff(sources: tuple[str, ...], size: int, min_size: int, runs: int | No
             if not as_json:
                 click.echo(tradeoff_text(own, missed))
             if source is sources[0]:
-                costs = list(tradeoff.costs(env, on, size=size, min_size=min_size, runs=runs or tradeoff.RUNS,
-                                            progress=of_one(report, env.name)))
+                costs = list(
+                    tradeoff.costs(
+                        env,
+                        on,
+                        size=size,
+                        min_size=min_size,
+                        runs=runs or tradeoff.RUNS,
+                        progress=of_one(report, env.name),
+                    )
+                )
     for row in tradeoff_rows(costs) if as_json else ():
         print_row(row)
     identity, measured = on.identity(), [c for c in costs if isinstance(c, tradeoff.Cost)]
@@ -153,30 +210,58 @@ def _spread(spread: Spread, factor: float, digits: int = 3) -> tuple[str, str]:
 
 def cases_text(cases: Sequence[Case], flops: Mapping[str, float]) -> str:
     """The table of the cases that can be measured."""
-    return table(["case", "kernel", "what", "counted in", "flops"],
-                 [[c.name, c.kernel, c.about, f"{c.unit}s", f"{flops[c.name]:g}" if c.name in flops else ""]
-                  for c in cases], left=4)
+    return table(
+        ["case", "kernel", "what", "counted in", "flops"],
+        [[c.name, c.kernel, c.about, f"{c.unit}s", f"{flops[c.name]:g}" if c.name in flops else ""] for c in cases],
+        left=4,
+    )
 
 
 def case_rows(cases: Sequence[Case], flops: Mapping[str, float]) -> list[dict[str, Any]]:
     """JSON rows of the cases that can be measured."""
-    return [{"event": "planned", "case": c.name, "kernel": c.kernel, "about": c.about, "unit": c.unit,
-             "flops": flops.get(c.name), "precisions": list(c.precisions)} for c in cases]
+    return [
+        {
+            "event": "planned",
+            "case": c.name,
+            "kernel": c.kernel,
+            "about": c.about,
+            "unit": c.unit,
+            "flops": flops.get(c.name),
+            "precisions": list(c.precisions),
+        }
+        for c in cases
+    ]
 
 
 def bench_text(rows: Sequence[Throughput], yardstick: Yardstick, device: str) -> str:
     """The throughput of kernels, below the limits of the device."""
     can = [[f"multiply-adds, float{p}", *_spread(s, 1), "GFLOP/s"] for p, s in yardstick.peak.items()]
-    can += [[what, *_spread(s, 1), "GB/s"] for what, s in (("memory read", yardstick.read),
-                                                           ("memory triad", yardstick.triad))]
+    can += [
+        [what, *_spread(s, 1), "GB/s"]
+        for what, s in (("memory read", yardstick.read), ("memory triad", yardstick.triad))
+    ]
     cells = []
     for r in rows:
         flops = ["", ""] if r.gflops is None or r.of_peak is None else [f"{r.gflops:.3g}", f"{r.of_peak:.2f}"]
-        cells.append([r.case, str(r.precision), *_spread(r.rate, 1e-6), f"M {r.unit}s/s", *flops, f"{r.gbytes:.2g}",
-                      f"{r.of_memory:.2f}"])
-    return "\n".join([device, table(["yardstick", "median", "(min … max)", ""], can), "",
-                      table(["case", "float", "median", "(min … max)", "", "GFLOP/s", "of peak", "GB/s", "of memory"],
-                            cells)])
+        cells.append(
+            [
+                r.case,
+                str(r.precision),
+                *_spread(r.rate, 1e-6),
+                f"M {r.unit}s/s",
+                *flops,
+                f"{r.gbytes:.2g}",
+                f"{r.of_memory:.2f}",
+            ]
+        )
+    return "\n".join(
+        [
+            device,
+            table(["yardstick", "median", "(min … max)", ""], can),
+            "",
+            table(["case", "float", "median", "(min … max)", "", "GFLOP/s", "of peak", "GB/s", "of memory"], cells),
+        ]
+    )
 
 
 def bench_row(row: Throughput) -> dict[str, Any]:
@@ -187,9 +272,13 @@ def bench_row(row: Throughput) -> dict[str, Any]:
 
 def yardstick_row(yardstick: Yardstick, device: Mapping[str, str]) -> dict[str, Any]:
     """The JSON row of the limits of the device."""
-    return {"event": "yardstick", "device": dict(device),
-            "gflops": {f"float{p}": _three(s) for p, s in yardstick.peak.items()},
-            "read_gbytes": _three(yardstick.read), "triad_gbytes": _three(yardstick.triad)}
+    return {
+        "event": "yardstick",
+        "device": dict(device),
+        "gflops": {f"float{p}": _three(s) for p, s in yardstick.peak.items()},
+        "read_gbytes": _three(yardstick.read),
+        "triad_gbytes": _three(yardstick.triad),
+    }
 
 
 def _three(spread: Spread) -> dict[str, float]:
@@ -199,8 +288,19 @@ def _three(spread: Spread) -> dict[str, float]:
 def tradeoff_text(points: Sequence[Point], missed: Sequence[Missed] = ()) -> str:
     """The table of error against time on one environment."""
     name = (points[0] if points else missed[0]).environment
-    cells = [[p.method, p.label, *_spread(p.seconds, 1e3), f"{1e3 * p.certificate:.3g}", f"{p.error:.1e}",
-              f"{p.worst:.1e}", f"{p.rmse:.1e}", "front" if p.front else ""] for p in points]
+    cells = [
+        [
+            p.method,
+            p.label,
+            *_spread(p.seconds, 1e3),
+            f"{1e3 * p.certificate:.3g}",
+            f"{p.error:.1e}",
+            f"{p.worst:.1e}",
+            f"{p.rmse:.1e}",
+            "front" if p.front else "",
+        ]
+        for p in points
+    ]
     head = ["method", "setting", "ms", "(min … max)", "certificate", "error", "worst", "rmse", ""]
     return "\n".join([name, table(head, cells, left=2), *_missed(missed)])
 
@@ -208,9 +308,16 @@ def tradeoff_text(points: Sequence[Point], missed: Sequence[Missed] = ()) -> str
 def costs_text(costs: Sequence[Cost], tolerance: float, missed: Sequence[Missed] = ()) -> str:
     """The table of what a level costs by size, source size and roughness."""
     name = (costs[0] if costs else missed[0]).environment
-    return "\n".join([f"cost at {tolerance:g} on {name}",
-                      table(["over", "value", "ms", "(min … max)"],
-                            [[c.over, f"{c.value:g}", *_spread(c.seconds, 1e3)] for c in costs]), *_missed(missed)])
+    return "\n".join(
+        [
+            f"cost at {tolerance:g} on {name}",
+            table(
+                ["over", "value", "ms", "(min … max)"],
+                [[c.over, f"{c.value:g}", *_spread(c.seconds, 1e3)] for c in costs],
+            ),
+            *_missed(missed),
+        ]
+    )
 
 
 def _missed(missed: Sequence[Missed]) -> list[str]:

@@ -1,4 +1,5 @@
 """`whitefurnace compare`: its options, what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -30,22 +31,38 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 5 not supp
 
 
 def axes(letter: str, default: str) -> options.Decorator:
-    return options.option(f"--axes-{letter.lower()}", metavar="AXES", heading="Comparison",
-                          help=f'Axes that {letter} is stored in, as "-x +y +z" or the name of an engine. {default}')
+    return options.option(
+        f"--axes-{letter.lower()}",
+        metavar="AXES",
+        heading="Comparison",
+        help=f'Axes that {letter} is stored in, as "-x +y +z" or the name of an engine. {default}',
+    )
 
 
 @options.command("Look and compare", "Compare the cubes, tables or harmonics of two files", EPILOG)
 @click.argument("a", type=options.FilePath)
 @click.argument("b", type=options.FilePath)
 @options.plot("error maps")
-@options.option("--max-error", metavar="X", type=float, heading="Comparison",
-                help="End with exit code 7 if the `error` of a level, or the `worst` of a table or of harmonics, is "
-                     "larger than X (0 or more).")
+@options.option(
+    "--max-error",
+    metavar="X",
+    type=float,
+    heading="Comparison",
+    help="End with exit code 7 if the `error` of a level, or the `worst` of a table or of harmonics, is "
+    "larger than X (0 or more).",
+)
 @axes("A", "[default: those of the engine that it was written for, else +x +y +z]")
 @axes("B", "[default: as for A]")
 @options.as_json()
-def compare(a: Path, b: Path, folder: Path | None, max_error: float | None, axes_a: str | None, axes_b: str | None,
-            as_json: bool) -> None:
+def compare(
+    a: Path,
+    b: Path,
+    folder: Path | None,
+    max_error: float | None,
+    axes_a: str | None,
+    axes_b: str | None,
+    as_json: bool,
+) -> None:
     """Compare the cubes, lat-longs, tables or harmonics of two files, in whichever containers they are."""
     from whitefurnace.inspection import comparison
     from whitefurnace.inspection.contents import contents
@@ -76,17 +93,43 @@ def compare(a: Path, b: Path, folder: Path | None, max_error: float | None, axes
 
 def compared_text(found: Comparison) -> str:
     """The table of the errors of A against B, a row for each part."""
-    rows = [[row.part, row.size, "" if row.roughness is None else f"{row.roughness:.3f}", f"{row.error:.1e}",
-             f"{row.worst:.1e}", "" if row.rmse is None else f"{row.rmse:.1e}",
-             "" if row.stated is None else f"{row.stated:.1e}", row.method, row.at] for row in found.rows]
+    rows = [
+        [
+            row.part,
+            row.size,
+            "" if row.roughness is None else f"{row.roughness:.3f}",
+            f"{row.error:.1e}",
+            f"{row.worst:.1e}",
+            "" if row.rmse is None else f"{row.rmse:.1e}",
+            "" if row.stated is None else f"{row.stated:.1e}",
+            row.method,
+            row.at,
+        ]
+        for row in found.rows
+    ]
     head = ["", "size", "r", "error", "worst", "rmse", "stated", "compared", "the worst at"]
-    lines = [f"{found.a.path} ({found.a.kind}, {found.a.container}) against "
-             f"{found.b.path} ({found.b.kind}, {found.b.container})"]
+    lines = [
+        f"{found.a.path} ({found.a.kind}, {found.a.container}) against "
+        f"{found.b.path} ({found.b.kind}, {found.b.container})"
+    ]
     return "\n".join([*lines, table(head, rows)])
 
 
 def compared_rows(found: Comparison) -> list[dict[str, Any]]:
     """JSON rows of a comparison."""
-    return [{"event": "compared", "part": row.part, "kind": row.kind, "size": row.size, "roughness": row.roughness,
-             "error": plain(row.error), "worst": plain(row.worst), "rmse": plain(row.rmse), "stated": row.stated,
-             "method": row.method, "worst_at": row.at} for row in found.rows]
+    return [
+        {
+            "event": "compared",
+            "part": row.part,
+            "kind": row.kind,
+            "size": row.size,
+            "roughness": row.roughness,
+            "error": plain(row.error),
+            "worst": plain(row.worst),
+            "rmse": plain(row.rmse),
+            "stated": row.stated,
+            "method": row.method,
+            "worst_at": row.at,
+        }
+        for row in found.rows
+    ]

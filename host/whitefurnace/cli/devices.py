@@ -1,4 +1,5 @@
 """`whitefurnace devices`: what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -36,6 +37,7 @@ def devices(as_json: bool) -> None:
 
 def devices_text(found: Sequence[Candidate]) -> str:
     """The table of devices with their verdicts."""
-    rows = [[str(c.index), c.type, f"{c.platform}: {c.name}", c.driver, "yes" if c.fp64 else "no", c.verdict]
-            for c in found]
+    rows = [
+        [str(c.index), c.type, f"{c.platform}: {c.name}", c.driver, "yes" if c.fp64 else "no", c.verdict] for c in found
+    ]
     return table(["", "type", "device", "driver", "float64", "verdict"], rows, left=6)

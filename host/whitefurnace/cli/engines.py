@@ -1,4 +1,5 @@
 """`whitefurnace engines`: its options, what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -14,14 +15,21 @@ from whitefurnace.text import table
 if TYPE_CHECKING:
     from whitefurnace.engines.presets import Engine
 
-EPILOG = ("\b\nExamples:\n  whitefurnace engines\n  whitefurnace engines filament\n"
-          "  whitefurnace engines bevy --toml > my_engine.toml")
+EPILOG = (
+    "\b\nExamples:\n  whitefurnace engines\n  whitefurnace engines filament\n"
+    "  whitefurnace engines bevy --toml > my_engine.toml"
+)
 
 
 @options.command("Lists", "List the engines that files can be baked for", EPILOG)
 @click.argument("name", required=False)
-@options.option("--toml", "as_toml", is_flag=True, heading=options.RUNNING,
-                help="Print the engine as TOML, a file that --for takes: a start for an engine of your own.")
+@options.option(
+    "--toml",
+    "as_toml",
+    is_flag=True,
+    heading=options.RUNNING,
+    help="Print the engine as TOML, a file that --for takes: a start for an engine of your own.",
+)
 @options.as_json()
 def engines(name: str | None, as_toml: bool, as_json: bool) -> None:
     """List the engines that `--for` knows, or show one (also a FILE.toml): its files, the roughness of each level, its
@@ -43,18 +51,29 @@ def engines(name: str | None, as_toml: bool, as_json: bool) -> None:
 
 def engines_text(engines: Sequence[Engine]) -> str:
     """The table of the engines that `--for` knows."""
-    rows = [[e.name, e.title.partition(": ")[0], "seen" if e.proven else "", e.lods_text, e.sh or "",
-             "" if e.container != "files" else f"{e.dfg.size}² {e.dfg.form}"] for e in engines]
+    rows = [
+        [
+            e.name,
+            e.title.partition(": ")[0],
+            "seen" if e.proven else "",
+            e.lods_text,
+            e.sh or "",
+            "" if e.container != "files" else f"{e.dfg.size}² {e.dfg.form}",
+        ]
+        for e in engines
+    ]
     return table(["engine", "of", "proven", "lod(r)", "harmonics", "table"], rows, left=6)
 
 
 def engine_text(engine: Engine) -> str:
     """The text of one engine: its files and how it reads them."""
-    lines = [f"{engine.name}: {engine.title}", f"  facts      {engine.facts}",
-             f"  lod(r)     {engine.lods_text}" + (", past r = 1 a lobe of that α" if engine.follow else ""),
-             f"  sizes      {engine.size}², " + (f"{engine.levels} levels" if engine.levels else
-                                                 f"to {engine.min_size}²"),
-             f"  axes       {engine.axes}"]
+    lines = [
+        f"{engine.name}: {engine.title}",
+        f"  facts      {engine.facts}",
+        f"  lod(r)     {engine.lods_text}" + (", past r = 1 a lobe of that α" if engine.follow else ""),
+        f"  sizes      {engine.size}², " + (f"{engine.levels} levels" if engine.levels else f"to {engine.min_size}²"),
+        f"  axes       {engine.axes}",
+    ]
     if engine.container == "files":
         lines += [f"  direction  mix(mirror, normal, {engine.bend})"] if engine.bend != "0" else []
         lines += [f"  radiance   mix(prefiltered, E/π, {engine.blend})"] if engine.blend != "0" else []
@@ -62,7 +81,8 @@ def engine_text(engine: Engine) -> str:
         lines += [f"  harmonics  {engine.sh}"] if engine.sh else []
         d = engine.dfg
         lines += [f"  table      {d.size}², x = {d.x}, y = {d.y}, {d.form}" + (", Charlie" if d.charlie else "")]
-        lines += [f"  file       {file.name.replace('{stem}', 'STEM')}: {file.holds}, {file.stored}"
-                  for file in engine.file]
+        lines += [
+            f"  file       {file.name.replace('{stem}', 'STEM')}: {file.holds}, {file.stored}" for file in engine.file
+        ]
         lines += [f"  step       {step}" for step in engine.steps]
     return "\n".join(lines)

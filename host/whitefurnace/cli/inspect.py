@@ -1,4 +1,5 @@
 """`whitefurnace inspect`: what it prints and its JSON row."""
+
 from __future__ import annotations
 
 import math
@@ -49,11 +50,17 @@ def inspect_text(row: Mapping[str, Any]) -> str:
     lines.append("  " + ", ".join(f"{name} {value}" for name, value in header.items()))
     lines += [f"  notice: {notice}" for notice in row["notices"]]
     if row["levels"]:
-        lines.append(table(["", "size", "r", "bytes", "least", "mean", "largest", "error", "format", "to know"],
-                           [_inspected(level) for level in row["levels"]]))
+        lines.append(
+            table(
+                ["", "size", "r", "bytes", "least", "mean", "largest", "error", "format", "to know"],
+                [_inspected(level) for level in row["levels"]],
+            )
+        )
     if "sh" in row:
-        lines.append("  spherical harmonics: mean radiance " +
-                     ", ".join(f"{x * math.sqrt(1 / (4 * math.pi)):.4g}" for x in row["sh"][0]))
+        lines.append(
+            "  spherical harmonics: mean radiance "
+            + ", ".join(f"{x * math.sqrt(1 / (4 * math.pi)):.4g}" for x in row["sh"][0])
+        )
     proven = row["statement"] is not None and row["statement"]["manifest"] is not None
     for key, value in row["keys"].items():
         if proven and key.startswith("whitefurnace:"):  # the manifest says the same, and more
@@ -71,12 +78,18 @@ def _inspected(level: Mapping[str, Any]) -> list[str]:
     notes = [f"{value} {names[name]}" for name, value in count.items()]
     notes += [f"alpha {level['alpha'][0]:.3g} … {level['alpha'][1]:.3g}"] if level["alpha"] else []
     mean, added = level["mean"], level.get("format_p99", level.get("format_worst"))
-    return [level["name"], level["size"],
-            "" if level["roughness"] is None else f"{level['roughness']:.3f}",
-            "" if level["bytes"] is None else size(level["bytes"]), f"{level['low']:.3g}",
-            " ".join(f"{x:.3g}" for x in mean), f"{level['high']:.4g}",
-            f"{level['error']:.1e}" if "error" in level else "",
-            "" if added is None else f"{added:.1e}", ", ".join(notes)]
+    return [
+        level["name"],
+        level["size"],
+        "" if level["roughness"] is None else f"{level['roughness']:.3f}",
+        "" if level["bytes"] is None else size(level["bytes"]),
+        f"{level['low']:.3g}",
+        " ".join(f"{x:.3g}" for x in mean),
+        f"{level['high']:.4g}",
+        f"{level['error']:.1e}" if "error" in level else "",
+        "" if added is None else f"{added:.1e}",
+        ", ".join(notes),
+    ]
 
 
 def _stated(statement: Mapping[str, Any] | None) -> list[str]:
@@ -85,8 +98,14 @@ def _stated(statement: Mapping[str, Any] | None) -> list[str]:
         return ["  no manifest lists it, and it states no error"]
     lines = []
     if statement["manifest"] is not None:
-        lines.append(f"  manifest {statement['manifest']}: " + (
-            "the digests match" if statement["whole"] else "what it lists is NOT what is there, it was changed since"))
+        lines.append(
+            f"  manifest {statement['manifest']}: "
+            + (
+                "the digests match"
+                if statement["whole"]
+                else "what it lists is NOT what is there, it was changed since"
+            )
+        )
     version = statement.get("whitefurnace", statement.get("version"))
     key = statement.get("key")
     made = [f"whitefurnace {version}"] if version else []
@@ -99,12 +118,15 @@ def _stated(statement: Mapping[str, Any] | None) -> list[str]:
     recipe = statement.get("recipe")
     if isinstance(recipe, Mapping):
         shown = {name: _short(value) for name, value in recipe.items() if value is not None}
-        lines.append("  recipe " + ", ".join(f"{name} {value if len(value) <= 60 else value[:60] + '…'}"
-                                            for name, value in shown.items()))
+        lines.append(
+            "  recipe "
+            + ", ".join(f"{name} {value if len(value) <= 60 else value[:60] + '…'}" for name, value in shown.items())
+        )
     if isinstance(statement.get("integral"), str):
         error = statement.get("error")
-        lines.append(f"  integral {statement['integral']}" + (
-            f", error {error:.1e}" if isinstance(error, float) else ""))
+        lines.append(
+            f"  integral {statement['integral']}" + (f", error {error:.1e}" if isinstance(error, float) else "")
+        )
     return lines
 
 

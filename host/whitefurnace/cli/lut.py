@@ -1,4 +1,5 @@
 """`whitefurnace lut`: its options, what it prints and its JSON row."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -54,70 +55,180 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of t
 @options.command("Bake and tabulate", "Tabulate an integral of a BRDF over roughness and view angle", EPILOG, HELP)
 @click.argument("kind")
 @options.output_file("Table to write: .npy, .exr, .png (values from 0 to 1), .ktx2, .dds or .h.")
-@options.option("--format", "stored", metavar="NAME", heading=OUTPUT,
-                help="Pixel format: rg16f, rgba16f or rgba32f in .ktx2 and .dds; r16 or r8 in .png. [default: the "
-                     "first of these that has enough channels]")
-@options.option("--for", "for_", metavar="ENGINE", heading=OUTPUT,
-                help="Use the size, axes and form that an engine reads (see `whitefurnace engines`). Of dfg.")
-@options.option("--scheme", metavar="NAME", heading=OUTPUT,
-                help=f"Form of the table, by default the first of its kind. {schemes_listed()}.")
-@options.option("--size", metavar="N|NxM", heading=AXES,
-                help="Number of cells along x and y, each 1 to 16384. [default: 128, 64 for ltc]")
-@options.option("--axis", "axes", metavar="NAME=A:B:N[:SCALE]", multiple=True, heading=AXES,
-                help="Vary the parameter NAME from A to B in N steps; may be repeated. SCALE is linear (the default), "
-                     "log, centres, sqrt, f0 or angle; a SCALE alone is that of NoV.")
-@options.option("--set", "fixed", metavar="NAME=VALUE", multiple=True, heading=AXES,
-                help="Fix the parameter NAME at VALUE; may be repeated.")
-@options.option("--backfacing", metavar="clamp|absolute", heading=AXES,
-                help="Accept view directions below the surface (NoV < 0): clamp NoV to 0, or take its absolute value. "
-                     "[default: refuse them]")
+@options.option(
+    "--format",
+    "stored",
+    metavar="NAME",
+    heading=OUTPUT,
+    help="Pixel format: rg16f, rgba16f or rgba32f in .ktx2 and .dds; r16 or r8 in .png. [default: the "
+    "first of these that has enough channels]",
+)
+@options.option(
+    "--for",
+    "for_",
+    metavar="ENGINE",
+    heading=OUTPUT,
+    help="Use the size, axes and form that an engine reads (see `whitefurnace engines`). Of dfg.",
+)
+@options.option(
+    "--scheme",
+    metavar="NAME",
+    heading=OUTPUT,
+    help=f"Form of the table, by default the first of its kind. {schemes_listed()}.",
+)
+@options.option(
+    "--size",
+    metavar="N|NxM",
+    heading=AXES,
+    help="Number of cells along x and y, each 1 to 16384. [default: 128, 64 for ltc]",
+)
+@options.option(
+    "--axis",
+    "axes",
+    metavar="NAME=A:B:N[:SCALE]",
+    multiple=True,
+    heading=AXES,
+    help="Vary the parameter NAME from A to B in N steps; may be repeated. SCALE is linear (the default), "
+    "log, centres, sqrt, f0 or angle; a SCALE alone is that of NoV.",
+)
+@options.option(
+    "--set",
+    "fixed",
+    metavar="NAME=VALUE",
+    multiple=True,
+    heading=AXES,
+    help="Fix the parameter NAME at VALUE; may be repeated.",
+)
+@options.option(
+    "--backfacing",
+    metavar="clamp|absolute",
+    heading=AXES,
+    help="Accept view directions below the surface (NoV < 0): clamp NoV to 0, or take its absolute value. "
+    "[default: refuse them]",
+)
 @options.ndf("[default: ggx, unless --diffuse or --brdf is given]", heading=MODELS)
-@options.option("--masking", metavar="NAME", heading=MODELS,
-                help="Masking and shadowing model, a name from `whitefurnace models`. [default: smith]")
-@options.option("--fresnel", metavar="NAME[:p=v,...]", heading=MODELS,
-                help=options.fresnel_help("") + " [default: one]")
-@options.option("--diffuse", metavar="NAME[:p=v,...]", heading=MODELS,
-                help="Diffuse model, added to the specular reflection of --ndf, or alone without --ndf. Of albedo and "
-                     "albedo_average.")
-@options.option("--brdf", metavar="FILE.clh", heading=MODELS,
-                help="A whole BRDF of your own, in RGB. Of albedo and albedo_average.")
+@options.option(
+    "--masking",
+    metavar="NAME",
+    heading=MODELS,
+    help="Masking and shadowing model, a name from `whitefurnace models`. [default: smith]",
+)
+@options.option(
+    "--fresnel", metavar="NAME[:p=v,...]", heading=MODELS, help=options.fresnel_help("") + " [default: one]"
+)
+@options.option(
+    "--diffuse",
+    metavar="NAME[:p=v,...]",
+    heading=MODELS,
+    help="Diffuse model, added to the specular reflection of --ndf, or alone without --ndf. Of albedo and "
+    "albedo_average.",
+)
+@options.option(
+    "--brdf", metavar="FILE.clh", heading=MODELS, help="A whole BRDF of your own, in RGB. Of albedo and albedo_average."
+)
 @options.light("Light source", heading=LIGHT)
-@options.option("--environment", metavar="ENV", heading=LIGHT,
-                help="Environment image in place of a light, in RGB.")
-@options.option("--normal", metavar="X Y Z", type=float, nargs=3, heading=LIGHT,
-                help="Surface normal in the environment. [default: 0 1 0]")
+@options.option("--environment", metavar="ENV", heading=LIGHT, help="Environment image in place of a light, in RGB.")
+@options.option(
+    "--normal",
+    metavar="X Y Z",
+    type=float,
+    nargs=3,
+    heading=LIGHT,
+    help="Surface normal in the environment. [default: 0 1 0]",
+)
 @options.rotate(LIGHT)
 @options.exposure(LIGHT)
 @options.nonfinite(LIGHT)
-@options.tolerance("Largest absolute error, above 0 and below 1. [default: 1e-6, or 1e-12 with --precision 64; some "
-                   "kinds have their own]")
-@options.option("--precision", metavar="32|64", type=int, default=32, show_default=True, heading=ACCURACY,
-                help="Bits of the floating-point numbers that the device computes with.")
-@options.option("--fit", metavar="bilinear", heading=ACCURACY,
-                help="With `bilinear`, fit the texels so that reads between them are most accurate. For tables of two "
-                     "axes; implies --as-read.")
+@options.tolerance(
+    "Largest absolute error, above 0 and below 1. [default: 1e-6, or 1e-12 with --precision 64; some "
+    "kinds have their own]"
+)
+@options.option(
+    "--precision",
+    metavar="32|64",
+    type=int,
+    default=32,
+    show_default=True,
+    heading=ACCURACY,
+    help="Bits of the floating-point numbers that the device computes with.",
+)
+@options.option(
+    "--fit",
+    metavar="bilinear",
+    heading=ACCURACY,
+    help="With `bilinear`, fit the texels so that reads between them are most accurate. For tables of two "
+    "axes; implies --as-read.",
+)
 @options.as_read("Also measure the error of reads between texels, from float16 and 8-bit textures too.")
 @options.device()
 @options.dry_run()
 @options.force()
 @options.as_json()
 @options.quiet()
-def lut(kind: str, output: Path, stored: str | None, for_: str | None, scheme: str | None, size: str | None,
-        axes: tuple[str, ...], fixed: tuple[str, ...], backfacing: str | None, ndf: str | None, masking: str | None,
-        fresnel: str | None, diffuse: str | None, brdf: str | None, light: str | None, environment: str | None,
-        normal: tuple[float, float, float] | None, rotate: float, exposure: float, nonfinite: str,
-        tolerance: float | None, precision: int, fit: str | None, as_read: bool, device: str | None, dry_run: bool,
-        force: bool, as_json: bool, quiet: bool) -> None:
+def lut(
+    kind: str,
+    output: Path,
+    stored: str | None,
+    for_: str | None,
+    scheme: str | None,
+    size: str | None,
+    axes: tuple[str, ...],
+    fixed: tuple[str, ...],
+    backfacing: str | None,
+    ndf: str | None,
+    masking: str | None,
+    fresnel: str | None,
+    diffuse: str | None,
+    brdf: str | None,
+    light: str | None,
+    environment: str | None,
+    normal: tuple[float, float, float] | None,
+    rotate: float,
+    exposure: float,
+    nonfinite: str,
+    tolerance: float | None,
+    precision: int,
+    fit: str | None,
+    as_read: bool,
+    device: str | None,
+    dry_run: bool,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """Write a table of an integral over a grid of parameters."""
     from whitefurnace.tables import lut as tables
     from whitefurnace.tables.axes import named, named_axes
 
-    request = tables.plan(tables.TableRequest(
-        kind, output, stored=stored, for_=for_, scheme=scheme, size=size, axes=named_axes("--axis", axes),
-        parameters=named("--set", fixed), backfacing=backfacing, ndf=ndf, masking=masking, fresnel=fresnel,
-        diffuse=diffuse, brdf=brdf, light=light, environment=environment, normal=normal, rotate=rotate,
-        exposure=exposure, nonfinite=nonfinite, tolerance=tolerance, precision=precision, fit=fit, as_read=as_read,
-        force=force))
+    request = tables.plan(
+        tables.TableRequest(
+            kind,
+            output,
+            stored=stored,
+            for_=for_,
+            scheme=scheme,
+            size=size,
+            axes=named_axes("--axis", axes),
+            parameters=named("--set", fixed),
+            backfacing=backfacing,
+            ndf=ndf,
+            masking=masking,
+            fresnel=fresnel,
+            diffuse=diffuse,
+            brdf=brdf,
+            light=light,
+            environment=environment,
+            normal=normal,
+            rotate=rotate,
+            exposure=exposure,
+            nonfinite=nonfinite,
+            tolerance=tolerance,
+            precision=precision,
+            fit=fit,
+            as_read=as_read,
+            force=force,
+        )
+    )
     with progress(not (quiet or as_json)) as report:
         made = tables.make(request, device, dry_run=dry_run, progress=report)
     for notice in () if quiet else made.notices:
@@ -143,13 +254,19 @@ def table_text(made: Table) -> str:
     lines = [f"{name}: {made.kind.name}, {made.subject}; array of {shape}, float{made.recipe['precision']}"]
     lines += [f"  {axis}  {along}" for axis, along in zip("xyzuvw", made.axes, strict=False)]
     if made.state == "planned":
-        return "\n".join([*lines, f"  would write {name}  {size(made.nbytes)} before compression",
-                          f"  would write {beside}  the manifest"])
+        return "\n".join(
+            [
+                *lines,
+                f"  would write {name}  {size(made.nbytes)} before compression",
+                f"  would write {beside}  the manifest",
+            ]
+        )
     lines += _stated_lines(made)
     where = f"on {m['device']['name']} ({m['device']['platform']})" if "device" in m else "in numpy"
     done = f"  error {m['error']:.1e}, rule {m['rule']}, {m['evaluations']:.2g} evaluations, {where}"
-    return "\n".join([*lines, done,
-                      f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {made.seconds:.2f} s"])
+    return "\n".join(
+        [*lines, done, f"  wrote {name}  {size(m['bytes'])}", f"  wrote {beside}  the manifest; {made.seconds:.2f} s"]
+    )
 
 
 def _stated_lines(made: Table) -> list[str]:
@@ -163,14 +280,24 @@ def _stated_lines(made: Table) -> list[str]:
     lines += made.kind.lines(m)
     if "as_read" in m:
         read = m["as_read"]
-        rows = [(name, *(f"{e[k]:.1e}" for k in ("p99", "max", "max_all"))) for name, e in
-                (("at texel centres", read["centres"]), *((f"between, {k}", e) for k, e in read["between"].items()))]
+        rows = [
+            (name, *(f"{e[k]:.1e}" for k in ("p99", "max", "max_all")))
+            for name, e in (
+                ("at texel centres", read["centres"]),
+                *((f"between, {k}", e) for k, e in read["between"].items()),
+            )
+        ]
         lines.append(table(["  as read", "p99", "max", "max, with r < .045"], [(f"  {r[0]}", *r[1:]) for r in rows]))
     return lines
 
 
 def table_row(made: Table) -> dict[str, Any]:
     """The JSON row of a table."""
-    return {"event": made.state, "file": str(made.path), "shape": list(made.shape), "seconds": made.seconds,
-            **{name: value for name, value in made.manifest.items() if name not in ("whitefurnace", "name")},
-            "notices": list(made.notices)}
+    return {
+        "event": made.state,
+        "file": str(made.path),
+        "shape": list(made.shape),
+        "seconds": made.seconds,
+        **{name: value for name, value in made.manifest.items() if name not in ("whitefurnace", "name")},
+        "notices": list(made.notices),
+    }

@@ -1,4 +1,5 @@
 """`whitefurnace models`: what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 import math
@@ -61,25 +62,58 @@ def _domains(entry: Model) -> list[str]:
 def model_text(entry: Model) -> str:
     """The text of one model: everything that its entry states."""
     lines = [f"{entry.slot} {entry.name}: {entry.title}", f"  source      {entry.citation.text}"]
-    rows = [[p.name, p.symbol, f"[{p.low:g}, {p.high:g}]", "" if p.default is None else f"{p.default:g}",
-             ", ".join(f"{v:g}" for v in p.typical), p.about] for p in entry.parameters]
+    rows = [
+        [
+            p.name,
+            p.symbol,
+            f"[{p.low:g}, {p.high:g}]",
+            "" if p.default is None else f"{p.default:g}",
+            ", ".join(f"{v:g}" for v in p.typical),
+            p.about,
+        ]
+        for p in entry.parameters
+    ]
     if rows:
-        lines += ["  parameters", table(["  name", "symbol", "domain", "default", "typical values", "what it is"],
-                                        [[f"  {row[0]}", *row[1:]] for row in rows], left=6)]
+        lines += [
+            "  parameters",
+            table(
+                ["  name", "symbol", "domain", "default", "typical values", "what it is"],
+                [[f"  {row[0]}", *row[1:]] for row in rows],
+                left=6,
+            ),
+        ]
     facts = [(name, fact) for name, fact in entry.facts.items() if isinstance(fact, str | int | float)]
     lines += [f"  {'facts' if k == 0 else '':10}  {name}: {fact}" for k, (name, fact) in enumerate(facts)]
     for k, (name, values) in enumerate(entry.presets.items()):
-        shown = ", ".join(f"{key} = {'/'.join(f'{x:g}' for x in v) if isinstance(v, tuple) else f'{v:g}'}"
-                          for key, v in values.items())
+        shown = ", ".join(
+            f"{key} = {'/'.join(f'{x:g}' for x in v) if isinstance(v, tuple) else f'{v:g}'}"
+            for key, v in values.items()
+        )
         lines.append(f"  {'presets' if k == 0 else '':10}  {entry.name}:{name}  {shown}")
     return "\n".join(lines)
 
 
 def model_rows(entries: Sequence[Model]) -> list[dict[str, Any]]:
     """JSON rows of the catalogue."""
-    return [{"slot": e.slot, "name": e.name, "title": e.title, "citation": e.citation.key,
-             "parameters": [{"name": p.name, "symbol": p.symbol, "unit": p.unit, "domain": [p.low, p.high],
-                             "typical": list(p.typical), "about": p.about} for p in e.parameters],
-             "presets": {name: dict(values) for name, values in e.presets.items()},
-             "facts": {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in e.facts.items()}}
-            for e in entries]
+    return [
+        {
+            "slot": e.slot,
+            "name": e.name,
+            "title": e.title,
+            "citation": e.citation.key,
+            "parameters": [
+                {
+                    "name": p.name,
+                    "symbol": p.symbol,
+                    "unit": p.unit,
+                    "domain": [p.low, p.high],
+                    "typical": list(p.typical),
+                    "about": p.about,
+                }
+                for p in e.parameters
+            ],
+            "presets": {name: dict(values) for name, values in e.presets.items()},
+            "facts": {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in e.facts.items()},
+        }
+        for e in entries
+    ]

@@ -3,6 +3,7 @@
 An option that several commands have stands here once, as a decorator. This module loads nothing heavy: `--help` is
 quick.
 """
+
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -58,8 +59,11 @@ class Group(click.Group):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write a definition list for each task of `TASKS`: the name of every command and its summary."""
-        known = [(name, command) for name in self.list_commands(ctx)
-                 if isinstance(command := self.get_command(ctx, name), Command)]
+        known = [
+            (name, command)
+            for name in self.list_commands(ctx)
+            if isinstance(command := self.get_command(ctx, name), Command)
+        ]
         width = max(len(name) for name, _ in known)
         for task in TASKS:
             rows = [(name.ljust(width), command.short_help or "") for name, command in known if command.task == task]
@@ -95,9 +99,15 @@ def output_file(help: str) -> Decorator:
 
 
 def ndf(help: str, *, default: str | None = None, heading: str) -> Decorator:
-    return option("--ndf", metavar="NAME[:p=v,...]", default=default, show_default=default is not None,
-                  heading=heading, help="Microfacet distribution with its parameters: a name from `whitefurnace "
-                                        f"models`, or a FILE.clh of your own. {help}".strip())
+    return option(
+        "--ndf",
+        metavar="NAME[:p=v,...]",
+        default=default,
+        show_default=default is not None,
+        heading=heading,
+        help="Microfacet distribution with its parameters: a name from `whitefurnace "
+        f"models`, or a FILE.clh of your own. {help}".strip(),
+    )
 
 
 def fresnel_help(help: str) -> str:
@@ -106,8 +116,13 @@ def fresnel_help(help: str) -> str:
 
 
 def light(help: str, *, multiple: bool = False, heading: str) -> Decorator:
-    return option("--light", metavar="NAME[:p=v,...]", multiple=multiple, heading=heading,
-                  help=f"{help}, a name from `whitefurnace models` with its parameters, as punctual:NoL=.5.")
+    return option(
+        "--light",
+        metavar="NAME[:p=v,...]",
+        multiple=multiple,
+        heading=heading,
+        help=f"{help}, a name from `whitefurnace models` with its parameters, as punctual:NoL=.5.",
+    )
 
 
 def tolerance(help: str, *, heading: str = "Accuracy") -> Decorator:
@@ -115,23 +130,48 @@ def tolerance(help: str, *, heading: str = "Accuracy") -> Decorator:
 
 
 def rotate(heading: str) -> Decorator:
-    return option("--rotate", metavar="DEG", type=float, default=0.0, heading=heading,
-                  help="Rotate the environment by DEG degrees about +Y, from +X towards +Z. [default: 0]")
+    return option(
+        "--rotate",
+        metavar="DEG",
+        type=float,
+        default=0.0,
+        heading=heading,
+        help="Rotate the environment by DEG degrees about +Y, from +X towards +Z. [default: 0]",
+    )
 
 
 def exposure(heading: str, what: str = "the radiance of the environment") -> Decorator:
-    return option("--exposure", metavar="EV", type=float, default=0.0, heading=heading,
-                  help=f"Multiply {what} by 2^EV; EV is -64 to 64. [default: 0]")
+    return option(
+        "--exposure",
+        metavar="EV",
+        type=float,
+        default=0.0,
+        heading=heading,
+        help=f"Multiply {what} by 2^EV; EV is -64 to 64. [default: 0]",
+    )
 
 
 def nonfinite(heading: str) -> Decorator:
-    return option("--nonfinite", metavar="refuse|zero", default="refuse", show_default=True, heading=heading,
-                  help="NaN, infinite and negative values in the environment: refuse the image, or set them to zero.")
+    return option(
+        "--nonfinite",
+        metavar="refuse|zero",
+        default="refuse",
+        show_default=True,
+        heading=heading,
+        help="NaN, infinite and negative values in the environment: refuse the image, or set them to zero.",
+    )
 
 
 def certify(help: str, *, default: int | None = None) -> Decorator:
-    return option("--certify", metavar="N", type=int, default=default, show_default=default is not None,
-                  heading="Accuracy", help=help)
+    return option(
+        "--certify",
+        metavar="N",
+        type=int,
+        default=default,
+        show_default=default is not None,
+        heading="Accuracy",
+        help=help,
+    )
 
 
 def as_read(help: str) -> Decorator:
@@ -139,28 +179,44 @@ def as_read(help: str) -> Decorator:
 
 
 def plot(what: str) -> Decorator:
-    return option("--plot", "folder", metavar="DIR", type=FilePath, heading="Output",
-                  help=f"Draw {what} as PNG files into the folder DIR. Needs matplotlib.")
+    return option(
+        "--plot",
+        "folder",
+        metavar="DIR",
+        type=FilePath,
+        heading="Output",
+        help=f"Draw {what} as PNG files into the folder DIR. Needs matplotlib.",
+    )
 
 
 def device(heading: str = RUNNING) -> Decorator:
-    return option("--device", metavar="NAME", heading=heading,
-                  help="OpenCL device: its number or a part of its name as `whitefurnace devices` lists them. "
-                       "[default: $WHITEFURNACE_DEVICE, else the best that works]")
+    return option(
+        "--device",
+        metavar="NAME",
+        heading=heading,
+        help="OpenCL device: its number or a part of its name as `whitefurnace devices` lists them. "
+        "[default: $WHITEFURNACE_DEVICE, else the best that works]",
+    )
 
 
 def dry_run(help: str = "Print what would be computed and written, and do nothing.") -> Decorator:
     return option("--dry-run", is_flag=True, heading=RUNNING, help=help)
 
 
-def force(help: str = "Make outputs again that are up to date, and overwrite files that this tool did not write.",
-          ) -> Decorator:
+def force(
+    help: str = "Make outputs again that are up to date, and overwrite files that this tool did not write.",
+) -> Decorator:
     return option("--force", is_flag=True, heading=RUNNING, help=help)
 
 
 def as_json() -> Decorator:
-    return option("--json", "as_json", is_flag=True, heading=RUNNING,
-                  help="Print the results as JSON Lines on stdout, and nothing else there.")
+    return option(
+        "--json",
+        "as_json",
+        is_flag=True,
+        heading=RUNNING,
+        help="Print the results as JSON Lines on stdout, and nothing else there.",
+    )
 
 
 def quiet(help: str = "Print errors only.") -> Decorator:

@@ -1,4 +1,5 @@
 """`whitefurnace render`: its options, what it prints and its JSON row."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -46,71 +47,195 @@ OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Truth beside the engine's picture
 @options.command("Look and compare", "Draw spheres from baked files as an engine shades them", EPILOG)
 @click.argument("manifest", type=options.FilePath)
 @options.output_file("Picture to write: .png, or with --truth also .exr with a layer for each picture.")
-@options.option("--for", "for_", metavar="ENGINE", required=True, heading=OUTPUT,
-                help="Engine whose files are read and whose shading is followed: one that the bake was made for.")
-@options.option("--size", metavar="N", type=int, default=128, show_default=True, heading=OUTPUT,
-                help="Edge of the square that holds one sphere in pixels, 8 to 2048.")
-@options.option("--background", metavar="environment|plain", default="environment", show_default=True, heading=OUTPUT,
-                help="Draw the environment or a plain colour behind the spheres.")
+@options.option(
+    "--for",
+    "for_",
+    metavar="ENGINE",
+    required=True,
+    heading=OUTPUT,
+    help="Engine whose files are read and whose shading is followed: one that the bake was made for.",
+)
+@options.option(
+    "--size",
+    metavar="N",
+    type=int,
+    default=128,
+    show_default=True,
+    heading=OUTPUT,
+    help="Edge of the square that holds one sphere in pixels, 8 to 2048.",
+)
+@options.option(
+    "--background",
+    metavar="environment|plain",
+    default="environment",
+    show_default=True,
+    heading=OUTPUT,
+    help="Draw the environment or a plain colour behind the spheres.",
+)
 @options.exposure(OUTPUT, "the radiance of the picture")
-@options.option("--columns", metavar="N", type=int, default=7, show_default=True, heading=SPHERES,
-                help="Spheres from left to right, 1 to 64, with roughness from 0 to 1.")
-@options.option("--rows", metavar="N", type=int, heading=SPHERES,
-                help="Spheres from top to bottom, 1 to 64, with metalness from 0 to 1. [default: 3]")
-@options.option("--base-color", metavar="R G B", type=float, nargs=3, heading=SPHERES,
-                help="Base colour of the spheres, linear, each 0 to 1. [default: 1 1 1]")
-@options.option("--scene", metavar="FILE", type=options.FilePath, heading=SPHERES,
-                help="Draw a sphere for each material of a .glb or .gltf in place of the grid. Needs pygltflib.")
-@options.option("--truth", metavar="ENV", heading=TRUTH,
-                help="Draw the full reflectance integral and the difference beside the engine's picture. ENV is the "
-                     "image that was baked. A PNG needs matplotlib. The options below need --truth.")
-@options.tolerance("Largest relative error of the truth (99th percentile), 1e-4 to 0.5; it sets the number of samples. "
-                   "[default: 1e-2]", heading=TRUTH)
-@options.option("--certify", metavar="N", type=int, heading=TRUTH,
-                help="Pixels of each column of the truth that are checked against a float64 quadrature, 0 to 1000. "
-                     "[default: 1]")
-@options.option("--multiscatter", is_flag=True, heading=TRUTH,
-                help="Scale the truth so that it regains the energy of multiple scattering between facets.")
+@options.option(
+    "--columns",
+    metavar="N",
+    type=int,
+    default=7,
+    show_default=True,
+    heading=SPHERES,
+    help="Spheres from left to right, 1 to 64, with roughness from 0 to 1.",
+)
+@options.option(
+    "--rows",
+    metavar="N",
+    type=int,
+    heading=SPHERES,
+    help="Spheres from top to bottom, 1 to 64, with metalness from 0 to 1. [default: 3]",
+)
+@options.option(
+    "--base-color",
+    metavar="R G B",
+    type=float,
+    nargs=3,
+    heading=SPHERES,
+    help="Base colour of the spheres, linear, each 0 to 1. [default: 1 1 1]",
+)
+@options.option(
+    "--scene",
+    metavar="FILE",
+    type=options.FilePath,
+    heading=SPHERES,
+    help="Draw a sphere for each material of a .glb or .gltf in place of the grid. Needs pygltflib.",
+)
+@options.option(
+    "--truth",
+    metavar="ENV",
+    heading=TRUTH,
+    help="Draw the full reflectance integral and the difference beside the engine's picture. ENV is the "
+    "image that was baked. A PNG needs matplotlib. The options below need --truth.",
+)
+@options.tolerance(
+    "Largest relative error of the truth (99th percentile), 1e-4 to 0.5; it sets the number of samples. "
+    "[default: 1e-2]",
+    heading=TRUTH,
+)
+@options.option(
+    "--certify",
+    metavar="N",
+    type=int,
+    heading=TRUTH,
+    help="Pixels of each column of the truth that are checked against a float64 quadrature, 0 to 1000. [default: 1]",
+)
+@options.option(
+    "--multiscatter",
+    is_flag=True,
+    heading=TRUTH,
+    help="Scale the truth so that it regains the energy of multiple scattering between facets.",
+)
 @options.ndf("[default: that of the bake]", heading=TRUTH)
-@options.option("--dielectric", metavar="NAME[:p=v,...]", heading=TRUTH,
-                help=options.fresnel_help(" at metalness 0") + " [default: schlick:f0=.04]")
-@options.option("--metal", metavar="NAME[:p=v,...]", heading=TRUTH,
-                help=options.fresnel_help(" at metalness 1") + " [default: Schlick's of the base colour]")
-@options.option("--diffuse", metavar="NAME[:p=v,...]", heading=TRUTH,
-                help="Diffuse model, as oren_nayar:sigma=.5; see `whitefurnace models`. [default: lambert]")
+@options.option(
+    "--dielectric",
+    metavar="NAME[:p=v,...]",
+    heading=TRUTH,
+    help=options.fresnel_help(" at metalness 0") + " [default: schlick:f0=.04]",
+)
+@options.option(
+    "--metal",
+    metavar="NAME[:p=v,...]",
+    heading=TRUTH,
+    help=options.fresnel_help(" at metalness 1") + " [default: Schlick's of the base colour]",
+)
+@options.option(
+    "--diffuse",
+    metavar="NAME[:p=v,...]",
+    heading=TRUTH,
+    help="Diffuse model, as oren_nayar:sigma=.5; see `whitefurnace models`. [default: lambert]",
+)
 @options.light("Further light beside the environment (may be repeated)", multiple=True, heading=TRUTH)
 @options.device(TRUTH)
 @options.force("Overwrite FILE if it exists.")
 @options.as_json()
-def render(manifest: Path, output: Path, for_: str, size: int, background: str, exposure: float, columns: int,
-           rows: int | None, base_color: tuple[float, float, float] | None, scene: Path | None, truth: str | None,
-           tolerance: float | None, certify: int | None, multiscatter: bool, ndf: str | None, dielectric: str | None,
-           metal: str | None, diffuse: str | None, light: tuple[str, ...], device: str | None, force: bool,
-           as_json: bool) -> None:
+def render(
+    manifest: Path,
+    output: Path,
+    for_: str,
+    size: int,
+    background: str,
+    exposure: float,
+    columns: int,
+    rows: int | None,
+    base_color: tuple[float, float, float] | None,
+    scene: Path | None,
+    truth: str | None,
+    tolerance: float | None,
+    certify: int | None,
+    multiscatter: bool,
+    ndf: str | None,
+    dielectric: str | None,
+    metal: str | None,
+    diffuse: str | None,
+    light: tuple[str, ...],
+    device: str | None,
+    force: bool,
+    as_json: bool,
+) -> None:
     """Draw a grid of spheres, or the materials of a scene, from the files that were baked for an engine, shaded as that
     engine does. With --truth, draw the full reflectance integral beside it."""
     if truth is None:
-        for name, given in (("tolerance", tolerance is not None), ("certify", certify is not None),
-                            ("multiscatter", multiscatter), ("ndf", ndf is not None),
-                            ("dielectric", dielectric is not None), ("metal", metal is not None),
-                            ("diffuse", diffuse is not None), ("light", bool(light)), ("device", device is not None)):
+        for name, given in (
+            ("tolerance", tolerance is not None),
+            ("certify", certify is not None),
+            ("multiscatter", multiscatter),
+            ("ndf", ndf is not None),
+            ("dielectric", dielectric is not None),
+            ("metal", metal is not None),
+            ("diffuse", diffuse is not None),
+            ("light", bool(light)),
+            ("device", device is not None),
+        ):
             if given:
                 raise UsageError(f"--{name} is of the truth: give the image of the bake as --truth ENV")
         from whitefurnace.rendering import shading
 
-        made = shading.render(manifest, output, for_=for_, size=size, columns=columns, rows=rows, exposure=exposure,
-                              base_color=base_color, background=background, scene=scene, force=force)
+        made = shading.render(
+            manifest,
+            output,
+            for_=for_,
+            size=size,
+            columns=columns,
+            rows=rows,
+            exposure=exposure,
+            base_color=base_color,
+            background=background,
+            scene=scene,
+            force=force,
+        )
         row, text = rendered_row(made), rendered_text(made)
     else:
         from whitefurnace.rendering import side_by_side
 
         with progress(not as_json) as report:
             both = side_by_side.render(
-                manifest, output, truth=truth, for_=for_, size=size, columns=columns, rows=rows, exposure=exposure,
-                base_color=base_color, background=background, scene=scene, tolerance=tolerance,
-                certify=1 if certify is None else certify, multiscatter=multiscatter, ndf=ndf, dielectric=dielectric,
-                metal=metal, diffuse=diffuse, light=light, device=device, force=force,
-                progress=of_one(report, output.name))
+                manifest,
+                output,
+                truth=truth,
+                for_=for_,
+                size=size,
+                columns=columns,
+                rows=rows,
+                exposure=exposure,
+                base_color=base_color,
+                background=background,
+                scene=scene,
+                tolerance=tolerance,
+                certify=1 if certify is None else certify,
+                multiscatter=multiscatter,
+                ndf=ndf,
+                dielectric=dielectric,
+                metal=metal,
+                diffuse=diffuse,
+                light=light,
+                device=device,
+                force=force,
+                progress=of_one(report, output.name),
+            )
         made, row, text = both, side_by_side_row(both), side_by_side_text(both)
     if as_json:
         print_row(row)
@@ -131,12 +256,25 @@ def rendered_text(made: Rendered) -> str:
     columns, rows = (" ".join(f"{x:.3g}" for x in values) for values in (made.roughness, made.metalness))
     of = [f"  across  roughness {columns}", f"  down    metalness {rows}"]
     if made.materials:
-        of = [table(["material", "row", "column", "base colour", "metalness", "roughness", "F0"],
-                    [[str(one["name"]), *(_values(one[key]) for key in ("row", "column", "base_color", "metalness",
-                                                                       "roughness", "f0"))]
-                     for one in made.materials])]
-    return "\n".join([f"{made.path}: {made.width} × {made.height} pixels, {made.engine}, exposure {made.exposure:g}",
-                      *of, *(f"  read    {path}" for path in made.read)])
+        of = [
+            table(
+                ["material", "row", "column", "base colour", "metalness", "roughness", "F0"],
+                [
+                    [
+                        str(one["name"]),
+                        *(_values(one[key]) for key in ("row", "column", "base_color", "metalness", "roughness", "f0")),
+                    ]
+                    for one in made.materials
+                ],
+            )
+        ]
+    return "\n".join(
+        [
+            f"{made.path}: {made.width} × {made.height} pixels, {made.engine}, exposure {made.exposure:g}",
+            *of,
+            *(f"  read    {path}" for path in made.read),
+        ]
+    )
 
 
 def _values(value: Any) -> str:
@@ -146,17 +284,26 @@ def _values(value: Any) -> str:
 
 
 def side_by_side_row(made: SideBySide) -> dict[str, Any]:
-    return {**rendered_row(made), "certificate": [vars(held) for held in made.certificate],
-            "error": made.error if made.certificate else None}
+    return {
+        **rendered_row(made),
+        "certificate": [vars(held) for held in made.certificate],
+        "error": made.error if made.certificate else None,
+    }
 
 
 def side_by_side_text(made: SideBySide) -> str:
     seconds = ", ".join(f"{name} {value:.1f} s" for name, value in made.seconds.items())
-    return "\n".join([
-        rendered_text(made),
-        f"  truth   samples {' '.join(map(str, made.samples))} a pixel, within {max(made.estimates):.1e} of four times "
-        f"as many; {seconds}",
-        *(f"  error   roughness {held.roughness:.3g}, n·v {held.NoV:.2f}, {held.of}: {held.error:.1e} of "
-          f"{' '.join(f'{x:.4g}' for x in held.exact)} by quadrature" for held in made.certificate),
-        f"  differs by {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of 100; "
-        f"the colours reach {100 * made.scale:g} %"])
+    return "\n".join(
+        [
+            rendered_text(made),
+            f"  truth   samples {' '.join(map(str, made.samples))} a pixel, within {max(made.estimates):.1e} of four times "
+            f"as many; {seconds}",
+            *(
+                f"  error   roughness {held.roughness:.3g}, n·v {held.NoV:.2f}, {held.of}: {held.error:.1e} of "
+                f"{' '.join(f'{x:.4g}' for x in held.exact)} by quadrature"
+                for held in made.certificate
+            ),
+            f"  differs by {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of 100; "
+            f"the colours reach {100 * made.scale:g} %",
+        ]
+    )

@@ -1,4 +1,5 @@
 """`whitefurnace scene`: its options, what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 import math
@@ -56,31 +57,74 @@ OUTPUT, SCENE, MEDIA = "Output", "Scene and lighting", "Media inside objects"
 @options.command("Scenes and batches", "List which textures and tables a glTF scene needs, or bake them", EPILOG)
 @click.argument("file", type=options.FilePath)
 @options.output_folder("Bake the parts that are needed into the folder DIR.")
-@options.option("--job", metavar="JOB.toml", type=options.FilePath, heading=OUTPUT,
-                help="Write the parts that are needed as a job for `whitefurnace batch`.")
-@options.option("--for", "for_", metavar="ENGINE", default="raw", show_default=True, heading=OUTPUT,
-                help="Target engine: a name from `whitefurnace engines`, or a FILE.toml that describes your own.")
-@options.option("--environment", "environments", metavar="ENV", multiple=True, heading=SCENE,
-                help="Environment image that lights the scene; may be repeated.")
-@options.option("--background", is_flag=True, heading=SCENE,
-                help="The environment is also visible behind the scene.")
-@options.option("--pixel", metavar="LENGTH", heading=MEDIA,
-                help="Length on the object that one pixel covers, as 0.5mm.")
-@options.option("--resolution", metavar="HEIGHT", type=int, heading=MEDIA,
-                help="In place of --pixel: the height of the image in pixels, 1 to 16384, seen by the scene's closest "
-                     "camera.")
-@options.option("--medium", "media", metavar="[MATERIAL:]MEDIUM", multiple=True, heading=MEDIA,
-                help="Medium inside one material, or inside all that have a volume; may be repeated. [default: that of "
-                     "KHR_materials_volume]")
-@options.tolerance("Find the cheapest bake whose files add at most X (RMS) to the error of reflected radiance, 1e-4 "
-                   "to 1. Needs --environment.")
+@options.option(
+    "--job",
+    metavar="JOB.toml",
+    type=options.FilePath,
+    heading=OUTPUT,
+    help="Write the parts that are needed as a job for `whitefurnace batch`.",
+)
+@options.option(
+    "--for",
+    "for_",
+    metavar="ENGINE",
+    default="raw",
+    show_default=True,
+    heading=OUTPUT,
+    help="Target engine: a name from `whitefurnace engines`, or a FILE.toml that describes your own.",
+)
+@options.option(
+    "--environment",
+    "environments",
+    metavar="ENV",
+    multiple=True,
+    heading=SCENE,
+    help="Environment image that lights the scene; may be repeated.",
+)
+@options.option("--background", is_flag=True, heading=SCENE, help="The environment is also visible behind the scene.")
+@options.option(
+    "--pixel", metavar="LENGTH", heading=MEDIA, help="Length on the object that one pixel covers, as 0.5mm."
+)
+@options.option(
+    "--resolution",
+    metavar="HEIGHT",
+    type=int,
+    heading=MEDIA,
+    help="In place of --pixel: the height of the image in pixels, 1 to 16384, seen by the scene's closest camera.",
+)
+@options.option(
+    "--medium",
+    "media",
+    metavar="[MATERIAL:]MEDIUM",
+    multiple=True,
+    heading=MEDIA,
+    help="Medium inside one material, or inside all that have a volume; may be repeated. [default: that of "
+    "KHR_materials_volume]",
+)
+@options.tolerance(
+    "Find the cheapest bake whose files add at most X (RMS) to the error of reflected radiance, 1e-4 "
+    "to 1. Needs --environment."
+)
 @options.device()
 @options.force()
 @options.as_json()
 @options.quiet()
-def scene(file: Path, output: Path | None, job: Path | None, for_: str, environments: tuple[str, ...],
-          background: bool, pixel: str | None, resolution: int | None, media: tuple[str, ...],
-          tolerance: float | None, device: str | None, force: bool, as_json: bool, quiet: bool) -> None:
+def scene(
+    file: Path,
+    output: Path | None,
+    job: Path | None,
+    for_: str,
+    environments: tuple[str, ...],
+    background: bool,
+    pixel: str | None,
+    resolution: int | None,
+    media: tuple[str, ...],
+    tolerance: float | None,
+    device: str | None,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """List which textures and tables the materials of a glTF scene need, bake only those, and say what that saves."""
     from whitefurnace.advice import needs as deciding
     from whitefurnace.engines.presets import engines as named
@@ -120,20 +164,27 @@ def scene(file: Path, output: Path | None, job: Path | None, for_: str, environm
         _tabulate(needs, output, device, force, as_json, quiet)
 
 
-def _check_options(output: Path | None, job: Path | None, environments: tuple[str, ...],
-                   tolerance: float | None) -> None:
+def _check_options(
+    output: Path | None, job: Path | None, environments: tuple[str, ...], tolerance: float | None
+) -> None:
     """Raises UsageError for options that exclude each other or miss another one."""
     if output is not None and job is not None:
         raise UsageError("give -o or --job, not both")
     if (output or job) and not environments:
         raise UsageError(f"{'-o' if output else '--job'} bakes an environment: give --environment ENV")
     if tolerance is not None and (job or not environments):
-        raise UsageError("--tolerance is for one environment after another: " + (
-            "give -o DIR, a job has the same options for all" if job else "give --environment ENV"))
+        raise UsageError(
+            "--tolerance is for one environment after another: "
+            + ("give -o DIR, a job has the same options for all" if job else "give --environment ENV")
+        )
 
 
-def _inside(found: Scene, pixel: str | None, rows: int | None, named: tuple[str, ...],
-            ) -> tuple[Sequence[Inside], Pixel | None]:
+def _inside(
+    found: Scene,
+    pixel: str | None,
+    rows: int | None,
+    named: tuple[str, ...],
+) -> tuple[Sequence[Inside], Pixel | None]:
     """What the media of a scene need at its scale, and the length that a pixel covers."""
     from whitefurnace.scenes import media
 
@@ -141,8 +192,15 @@ def _inside(found: Scene, pixel: str | None, rows: int | None, named: tuple[str,
     return media.inside(found, covered, media.named_media(named, found)), covered
 
 
-def _measure(found: Scene, needs: Needs, environments: tuple[str, ...], tolerance: float | None, device: str | None,
-             as_json: bool, quiet: bool) -> dict[str, dict[str, Any]]:
+def _measure(
+    found: Scene,
+    needs: Needs,
+    environments: tuple[str, ...],
+    tolerance: float | None,
+    device: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> dict[str, dict[str, Any]]:
     """Print the error of each approximation in each environment; the options of the chosen bake by environment."""
     from whitefurnace.advice import budget
 
@@ -160,8 +218,17 @@ def _measure(found: Scene, needs: Needs, environments: tuple[str, ...], toleranc
     return best
 
 
-def _bake(needs: Needs, for_: str, environments: tuple[str, ...], output: Path, device: str | None, force: bool,
-          as_json: bool, quiet: bool, best: Mapping[str, dict[str, Any]]) -> None:
+def _bake(
+    needs: Needs,
+    for_: str,
+    environments: tuple[str, ...],
+    output: Path,
+    device: str | None,
+    force: bool,
+    as_json: bool,
+    quiet: bool,
+    best: Mapping[str, dict[str, Any]],
+) -> None:
     """Bake what a scene needs of every environment, with the options of `best` where some were chosen."""
     from whitefurnace.advice import needs as deciding
     from whitefurnace.baking import bake as baking
@@ -192,8 +259,15 @@ def _tabulate(needs: Needs, output: Path, device: str | None, force: bool, as_js
     with progress(not (quiet or as_json)) as report:
         for one in needs.tables:
             own = {key: value for key, value in one.items() if key not in ("kind", "output", "set")}
-            request = tables.plan(tables.TableRequest(one["kind"], output / one["output"], force=force,
-                                                      parameters=named("--set", one.get("set", [])), **own))
+            request = tables.plan(
+                tables.TableRequest(
+                    one["kind"],
+                    output / one["output"],
+                    force=force,
+                    parameters=named("--set", one.get("set", [])),
+                    **own,
+                )
+            )
             print_table(tables.make(request, device, progress=report), as_json, quiet)
 
 
@@ -201,37 +275,65 @@ def scene_text(scene: Scene, needs: Needs) -> str:
     """The text of a scene: its materials, and which parts of a bake they need."""
     box = scene.extent
     uses = sum(m.uses for m in scene.materials)
-    head = [f"{len(scene.materials)} material{'' if len(scene.materials) == 1 else 's'} on {uses} "
-            f"primitive{'' if uses == 1 else 's'}"]
+    head = [
+        f"{len(scene.materials)} material{'' if len(scene.materials) == 1 else 's'} on {uses} "
+        f"primitive{'' if uses == 1 else 's'}"
+    ]
     head += [" × ".join(f"{x:.3g}" for x in box) + " m"] if box else []
     for count, what in ((len(scene.cameras), "camera"), (scene.lights, "punctual light")):
         head += [f"{count} {what}{'' if count == 1 else 's'}"] if count else []
-    rows = [[m.name, _spread_text(m["base_color"]), _spread_text(m["metalness"]), _spread_text(m["roughness"]),
-             ", ".join(_also(m))] for m in scene.materials]
+    rows = [
+        [
+            m.name,
+            _spread_text(m["base_color"]),
+            _spread_text(m["metalness"]),
+            _spread_text(m["roughness"]),
+            ", ".join(_also(m)),
+        ]
+        for m in scene.materials
+    ]
     lines = [f"{scene.path}: {', '.join(head)}"]
     lines += [table(["material", "base colour", "metalness", "roughness", "and"], rows, left=5)] if rows else []
     lines.append(f"  for {needs.engine.name}, before compression:")
     verdict = {True: "yes", False: "no", None: "cannot"}
-    lines.append(table(["needed", "", "usual", "here", "because"],
-                       [[verdict[row.needed], row.what, size(row.nbytes) if row.nbytes else "",
-                         size(row.kept) if row.kept else "0" if row.nbytes else "", row.reason] for row in needs.rows],
-                       left=5))
+    lines.append(
+        table(
+            ["needed", "", "usual", "here", "because"],
+            [
+                [
+                    verdict[row.needed],
+                    row.what,
+                    size(row.nbytes) if row.nbytes else "",
+                    size(row.kept) if row.kept else "0" if row.nbytes else "",
+                    row.reason,
+                ]
+                for row in needs.rows
+            ],
+            left=5,
+        )
+    )
     return "\n".join([*lines, f"  {_saved(needs)}"])
 
 
 def _saved(needs: Needs) -> str:
     if needs.own is None:
-        return f"nothing is to be baked: it saves {size(needs.full_nbytes)} and about {needs.full_seconds:.2g} s of " \
-               "processor time"
-    options = [f"--{name.replace('_', '-')} {','.join(v) if isinstance(v, list) else v}"
-               for name, v in needs.options.items()]
+        return (
+            f"nothing is to be baked: it saves {size(needs.full_nbytes)} and about {needs.full_seconds:.2g} s of "
+            "processor time"
+        )
+    options = [
+        f"--{name.replace('_', '-')} {','.join(v) if isinstance(v, list) else v}" for name, v in needs.options.items()
+    ]
     bake = " ".join(["bake", *options]) if options else "the usual bake"
-    return (f"{size(needs.nbytes)} in place of {size(needs.full_nbytes)}, about {needs.seconds:.2g} s of processor "
-            f"time in place of {needs.full_seconds:.2g}: {bake}")
+    return (
+        f"{size(needs.nbytes)} in place of {size(needs.full_nbytes)}, about {needs.seconds:.2g} s of processor "
+        f"time in place of {needs.full_seconds:.2g}: {bake}"
+    )
 
 
 def _spread_text(spread: Spread) -> str:
     """A value, or its range over a texture with the mean, as text."""
+
     def one(values: Sequence[float]) -> str:
         return f"{values[0]:.3g}" if len(set(values)) == 1 else "/".join(f"{v:.3g}" for v in values)
 
@@ -245,29 +347,78 @@ def _also(m: Material) -> list[str]:
     """Further values of a material that its file gives, as text."""
     core = ("base_color", "metalness", "roughness")
     words = ["unlit"] if m.unlit else []
-    return words + [f"{name.replace('_', ' ')} {_spread_text(spread)}" for name, spread in m.values.items()
-                   if name not in core and spread.given != "default"]
+    return words + [
+        f"{name.replace('_', ' ')} {_spread_text(spread)}"
+        for name, spread in m.values.items()
+        if name not in core and spread.given != "default"
+    ]
 
 
 def scene_rows(scene: Scene, needs: Needs) -> list[dict[str, Any]]:
     """JSON rows: the scene, each material, each need, and the whole."""
+
     def plain(x: float) -> float | None:
         return x if math.isfinite(x) else None  # an attenuation distance
 
-    rows: list[dict[str, Any]] = [{
-        "event": "scene", "file": str(scene.path), "low": scene.low, "high": scene.high, "lights": scene.lights,
-        "cameras": [vars(camera) for camera in scene.cameras], "notices": list(scene.notices)}]
-    rows += [{"event": "material", "name": m.name, "uses": m.uses, "unlit": m.unlit, "extensions": list(m.given),
-              "values": {name: {"low": [plain(x) for x in s.low], "high": [plain(x) for x in s.high],
-                                "mean": [plain(x) for x in s.mean], "given": s.given, "seen": s.seen,
-                                **({"histogram": list(s.histogram)} if s.histogram else {})}
-                         for name, s in m.values.items()}} for m in scene.materials]
-    rows += [{"event": "need", "for": needs.engine.name, "what": row.what, "kind": row.kind, "needed": row.needed,
-              "reason": row.reason, "usual_bytes": row.nbytes, "bytes": row.kept} for row in needs.rows]
-    return [*rows, {"event": "needs", "for": needs.engine.name, "bake": needs.own is not None, "options": needs.options,
-                    "tables": list(needs.tables), "charlie": needs.cloth, "bytes": needs.nbytes,
-                    "usual_bytes": needs.full_nbytes, "predicted": {"cpu_seconds": needs.seconds,
-                                                                    "usual_cpu_seconds": needs.full_seconds}}]
+    rows: list[dict[str, Any]] = [
+        {
+            "event": "scene",
+            "file": str(scene.path),
+            "low": scene.low,
+            "high": scene.high,
+            "lights": scene.lights,
+            "cameras": [vars(camera) for camera in scene.cameras],
+            "notices": list(scene.notices),
+        }
+    ]
+    rows += [
+        {
+            "event": "material",
+            "name": m.name,
+            "uses": m.uses,
+            "unlit": m.unlit,
+            "extensions": list(m.given),
+            "values": {
+                name: {
+                    "low": [plain(x) for x in s.low],
+                    "high": [plain(x) for x in s.high],
+                    "mean": [plain(x) for x in s.mean],
+                    "given": s.given,
+                    "seen": s.seen,
+                    **({"histogram": list(s.histogram)} if s.histogram else {}),
+                }
+                for name, s in m.values.items()
+            },
+        }
+        for m in scene.materials
+    ]
+    rows += [
+        {
+            "event": "need",
+            "for": needs.engine.name,
+            "what": row.what,
+            "kind": row.kind,
+            "needed": row.needed,
+            "reason": row.reason,
+            "usual_bytes": row.nbytes,
+            "bytes": row.kept,
+        }
+        for row in needs.rows
+    ]
+    return [
+        *rows,
+        {
+            "event": "needs",
+            "for": needs.engine.name,
+            "bake": needs.own is not None,
+            "options": needs.options,
+            "tables": list(needs.tables),
+            "charlie": needs.cloth,
+            "bytes": needs.nbytes,
+            "usual_bytes": needs.full_nbytes,
+            "predicted": {"cpu_seconds": needs.seconds, "usual_cpu_seconds": needs.full_seconds},
+        },
+    ]
 
 
 def media_text(found: Sequence[Inside], pixel: Pixel | None) -> str:
@@ -283,19 +434,30 @@ def media_text(found: Sequence[Inside], pixel: Pixel | None) -> str:
 def media_rows(found: Sequence[Inside], pixel: Pixel | None) -> list[dict[str, Any]]:
     """A JSON row for each medium."""
     of = {"camera": pixel.of or None} if pixel else {}
-    return [{"event": "medium", "material": one.material or None, "size_of": one.size_of or None,
-             "reason": one.reason or None, "table": one.table, **of,
-             **(one.judgement.data() if one.judgement else {"subsurface": False})} for one in found]
+    return [
+        {
+            "event": "medium",
+            "material": one.material or None,
+            "size_of": one.size_of or None,
+            "reason": one.reason or None,
+            "table": one.table,
+            **of,
+            **(one.judgement.data() if one.judgement else {"subsurface": False}),
+        }
+        for one in found
+    ]
 
 
 def budget_text(found: Budget, choice: Choice | None = None) -> str:
     """The text of each approximation's error on a scene in one environment, and of the bake that was chosen."""
     rows = [*(e for e in found.entries if e.used), found.files, found.floor, found.whole]
-    head = [f"  errors of reflected radiance in {found.environment}, at {found.points} points of the scene's materials",
-            table(["part", "", "rms", "p95", ""], [_entry_cells(e) for e in rows], left=5),
-            f"  largest: {found.largest.name}; they do not add up; the integral is within {found.accuracy:.1g} (p99)",
-            "  other ways would change what is right by",
-            table(["", "", "rms", "p95", ""], [_entry_cells(e) for e in found.entries if not e.used], left=5)]
+    head = [
+        f"  errors of reflected radiance in {found.environment}, at {found.points} points of the scene's materials",
+        table(["part", "", "rms", "p95", ""], [_entry_cells(e) for e in rows], left=5),
+        f"  largest: {found.largest.name}; they do not add up; the integral is within {found.accuracy:.1g} (p99)",
+        "  other ways would change what is right by",
+        table(["", "", "rms", "p95", ""], [_entry_cells(e) for e in found.entries if not e.used], left=5),
+    ]
     return "\n".join([*head, *_chosen_lines(found, choice)])
 
 
@@ -307,37 +469,75 @@ def _entry_cells(e: Entry) -> list[str]:
 def _chosen_lines(found: Budget, choice: Choice | None) -> Iterable[str]:
     if choice is None:
         return
-    options = " ".join(f"--{name.replace('_', '-')} {','.join(v) if isinstance(v, list) else f'{v:g}'}"
-                       if not isinstance(v, str) else f"--{name} {v}" for name, v in choice.options.items()
-                       if name != "format")
+    options = " ".join(
+        f"--{name.replace('_', '-')} {','.join(v) if isinstance(v, list) else f'{v:g}'}"
+        if not isinstance(v, str)
+        else f"--{name} {v}"
+        for name, v in choice.options.items()
+        if name != "format"
+    )
     own = f", its chain as {choice.options['format']}" if "format" in choice.options else ""
     if choice.met:
-        yield (f"  cheapest within {choice.tolerance:g}: bake --for {found.engine} {options}{own}: "
-               f"{size(choice.nbytes)} in place of {size(choice.usual_nbytes)}; its files add {choice.error:.2g}, and "
-               f"{choice.binds.name} binds ({choice.binds.rms:.2g})")
+        yield (
+            f"  cheapest within {choice.tolerance:g}: bake --for {found.engine} {options}{own}: "
+            f"{size(choice.nbytes)} in place of {size(choice.usual_nbytes)}; its files add {choice.error:.2g}, and "
+            f"{choice.binds.name} binds ({choice.binds.rms:.2g})"
+        )
     else:
-        yield (f"  none of {choice.tried} sets of files is within {choice.tolerance:g}; the least error, "
-               f"{choice.error:.2g}, has bake --for {found.engine} {options}{own}; {choice.binds.name} binds "
-               f"({choice.binds.rms:.2g})")
+        yield (
+            f"  none of {choice.tried} sets of files is within {choice.tolerance:g}; the least error, "
+            f"{choice.error:.2g}, has bake --for {found.engine} {options}{own}; {choice.binds.name} binds "
+            f"({choice.binds.rms:.2g})"
+        )
     for e in choice.beyond:
         yield f"  no choice reaches {choice.tolerance:g} of {e.name}: {e.rms:.2g} ({e.what})"
 
 
 def budget_rows(found: Budget, choice: Choice | None = None) -> list[dict[str, Any]]:
     """JSON rows: each approximation, the whole, and the choice."""
+
     def row(e: Entry) -> dict[str, Any]:
-        return {"name": e.name, "kind": e.kind, "rms": e.rms, "p95": e.p95, "used": e.used, "bound": e.bound,
-                "what": e.what}
+        return {
+            "name": e.name,
+            "kind": e.kind,
+            "rms": e.rms,
+            "p95": e.p95,
+            "used": e.used,
+            "bound": e.bound,
+            "what": e.what,
+        }
 
     where = {"for": found.engine, "environment": found.environment}
     rows: list[dict[str, Any]] = [{"event": "approximation", **where, **row(e)} for e in found.entries]
-    rows.append({"event": "budget", **where, "points": found.points, "accuracy": found.accuracy,
-                 "levels": [{"size": s, "roughness": r} for s, r in found.levels], "largest": found.largest.name,
-                 "files": row(found.files), "exact_files": row(found.floor), "whole": row(found.whole),
-                 "notices": list(found.notices)})
+    rows.append(
+        {
+            "event": "budget",
+            **where,
+            "points": found.points,
+            "accuracy": found.accuracy,
+            "levels": [{"size": s, "roughness": r} for s, r in found.levels],
+            "largest": found.largest.name,
+            "files": row(found.files),
+            "exact_files": row(found.floor),
+            "whole": row(found.whole),
+            "notices": list(found.notices),
+        }
+    )
     if choice is not None:
-        rows.append({"event": "choice", **where, "tolerance": choice.tolerance, "met": choice.met,
-                     "options": dict(choice.options), "bytes": choice.nbytes, "usual_bytes": choice.usual_nbytes,
-                     "error": choice.error, "whole": choice.whole, "binds": choice.binds.name,
-                     "beyond": [row(e) for e in choice.beyond], "tried": choice.tried})
+        rows.append(
+            {
+                "event": "choice",
+                **where,
+                "tolerance": choice.tolerance,
+                "met": choice.met,
+                "options": dict(choice.options),
+                "bytes": choice.nbytes,
+                "usual_bytes": choice.usual_nbytes,
+                "error": choice.error,
+                "whole": choice.whole,
+                "binds": choice.binds.name,
+                "beyond": [row(e) for e in choice.beyond],
+                "tried": choice.tried,
+            }
+        )
     return rows

@@ -1,4 +1,5 @@
 """What all commands print with: JSON rows on stdout, notices on stderr, progress bars where stderr is a terminal."""
+
 from __future__ import annotations
 
 import contextlib
@@ -44,8 +45,12 @@ def progress(wanted: bool) -> Iterator[Callable[[str, str, float], None] | None]
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:>3.0f}%"),
-               TimeElapsedColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f}%"),
+        TimeElapsedColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         tasks: dict[str, Any] = {}
 

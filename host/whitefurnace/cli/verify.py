@@ -1,4 +1,5 @@
 """`whitefurnace verify`: its options, what it prints and its JSON rows."""
+
 from __future__ import annotations
 
 import time
@@ -35,13 +36,19 @@ or build, 5 not supported, 7 a check failed, 130 interrupted.
 @options.command("Prove and measure", "Check models against exact values and float64 references", EPILOG)
 @click.argument("specs", metavar="[MODEL|FILE.clh...]", nargs=-1)
 @options.plot("shapes, curves and error maps")
-@options.option("--precision", metavar="32|64", type=int, heading="Accuracy",
-                help="Check one floating-point precision only. [default: both, where the device has float64]")
+@options.option(
+    "--precision",
+    metavar="32|64",
+    type=int,
+    heading="Accuracy",
+    help="Check one floating-point precision only. [default: both, where the device has float64]",
+)
 @options.device()
 @options.as_json()
 @options.quiet("Print failed checks only.")
-def verify(specs: tuple[str, ...], folder: Path | None, precision: int | None, device: str | None, as_json: bool,
-           quiet: bool) -> None:
+def verify(
+    specs: tuple[str, ...], folder: Path | None, precision: int | None, device: str | None, as_json: bool, quiet: bool
+) -> None:
     """Check models against exact values, float64 references and the facts that their entries state.
 
     Without a MODEL the whole catalogue is checked; otherwise those named (ggx, ggx:alpha=.3, schlick:gold) and files
@@ -79,8 +86,10 @@ def verify(specs: tuple[str, ...], folder: Path | None, precision: int | None, d
         click.echo(verify_summary(rows, time.perf_counter() - start, on.identity()["name"]))
     failed = [row for row in rows if not row.passed]
     if failed:
-        raise CheckError(f"{len(failed)} of {len(rows)} checks failed, the first: {failed[0].slot} {failed[0].model}, "
-                         f"{failed[0].check} in float{failed[0].precision}")
+        raise CheckError(
+            f"{len(failed)} of {len(rows)} checks failed, the first: {failed[0].slot} {failed[0].model}, "
+            f"{failed[0].check} in float{failed[0].precision}"
+        )
 
 
 def _print_rows(rows: Sequence[Row], first: bool, as_json: bool, quiet: bool) -> None:
@@ -93,8 +102,10 @@ def _print_rows(rows: Sequence[Row], first: bool, as_json: bool, quiet: bool) ->
             click.echo(VERIFY_HEAD)
         click.echo(verify_text(shown))
 
-VERIFY_HEAD = (f"  {'check':<40} {'float':>5} {'value':>14} {'expected':>12} {'error':>8} {'tolerance':>9}  verdict  "
-               "worst at")
+
+VERIFY_HEAD = (
+    f"  {'check':<40} {'float':>5} {'value':>14} {'expected':>12} {'error':>8} {'tolerance':>9}  verdict  worst at"
+)
 
 
 def verify_text(rows: Sequence[Row]) -> str:
@@ -102,19 +113,25 @@ def verify_text(rows: Sequence[Row]) -> str:
     lines = [f"{rows[0].slot} {rows[0].model}"]
     for row in rows:
         verdict = "FAIL" if not row.passed else "pass" if row.tolerance is not None else "told"
-        expected, error, tolerance = ("" if x is None else format(x, digits) for x, digits in (
-            (row.expected, ".8g"), (row.error, ".1e"), (row.tolerance, ".1e")))
+        expected, error, tolerance = (
+            "" if x is None else format(x, digits)
+            for x, digits in ((row.expected, ".8g"), (row.error, ".1e"), (row.tolerance, ".1e"))
+        )
         figures = f"{row.value:>14.9g} {expected:>12} {error:>8} {tolerance:>9}"
         lines.append(f"  {row.check:<40} {row.precision:>5} {figures}  {verdict:<7}  {_where(row.parameters)}".rstrip())
         if not row.passed:
-            lines += [f"      counterexample: {_where(row.counterexample or {}, '.9g')}".rstrip(),
-                      *([f"      {row.note}"] if row.note else [])]
+            lines += [
+                f"      counterexample: {_where(row.counterexample or {}, '.9g')}".rstrip(),
+                *([f"      {row.note}"] if row.note else []),
+            ]
     return "\n".join(lines)
 
 
 def _where(values: Mapping[str, Any], digits: str = ".4g") -> str:
-    return ", ".join(f"{name} = ({', '.join(format(x, digits) for x in v)})" if isinstance(v, Sequence) else
-                     f"{name} = {v:{digits}}" for name, v in values.items())
+    return ", ".join(
+        f"{name} = ({', '.join(format(x, digits) for x in v)})" if isinstance(v, Sequence) else f"{name} = {v:{digits}}"
+        for name, v in values.items()
+    )
 
 
 def verify_summary(rows: Sequence[Row], seconds: float, device: str) -> str:
@@ -122,14 +139,32 @@ def verify_summary(rows: Sequence[Row], seconds: float, device: str) -> str:
     informational = sum(row.tolerance is None and row.passed for row in rows)
     failed = sum(not row.passed for row in rows)
     subjects = len({(row.slot, row.model) for row in rows})
-    return (f"{len(rows) - informational} checks of {subjects} {'model' if subjects == 1 else 'models'}: "
-            f"{len(rows) - informational - failed} passed, {failed} failed"
-            + (f"; {informational} figures told" if informational else "") + f"; {seconds:.1f} s on {device}")
+    return (
+        f"{len(rows) - informational} checks of {subjects} {'model' if subjects == 1 else 'models'}: "
+        f"{len(rows) - informational - failed} passed, {failed} failed"
+        + (f"; {informational} figures told" if informational else "")
+        + f"; {seconds:.1f} s on {device}"
+    )
 
 
 def verify_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """JSON rows of checks; NaN and infinities are strings."""
-    return [{"event": "check", "slot": r.slot, "model": r.model, "check": r.check, "parameters": plain(r.parameters),
-             "precision": r.precision, "value": plain(r.value), "expected": plain(r.expected),
-             "error": plain(r.error), "tolerance": plain(r.tolerance), "passed": r.passed, "cells": r.cells,
-             "note": r.note, "counterexample": plain(r.counterexample)} for r in rows]
+    return [
+        {
+            "event": "check",
+            "slot": r.slot,
+            "model": r.model,
+            "check": r.check,
+            "parameters": plain(r.parameters),
+            "precision": r.precision,
+            "value": plain(r.value),
+            "expected": plain(r.expected),
+            "error": plain(r.error),
+            "tolerance": plain(r.tolerance),
+            "passed": r.passed,
+            "cells": r.cells,
+            "note": r.note,
+            "counterexample": plain(r.counterexample),
+        }
+        for r in rows
+    ]

@@ -2,6 +2,7 @@
 
 Presets are such descriptions, and so are users' TOML files.
 """
+
 from __future__ import annotations
 
 import re
@@ -202,8 +203,9 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
         """Whether a bake for it needs `holds` as cubes."""
         if holds == "specular" and self.holding("skybox"):
             return True
-        return self.needs(holds) and (self.container != "files" or any(
-            file.layout == "cube" for file in self.holding(holds)))
+        return self.needs(holds) and (
+            self.container != "files" or any(file.layout == "cube" for file in self.holding(holds))
+        )
 
     def data(self) -> dict[str, Any]:
         """The description as plain data, which is part of a bake's key."""
@@ -223,7 +225,7 @@ def axes_matrix(text: str, where: str = "axes") -> tuple[tuple[int, int, int], .
     found = re.fullmatch(r"\s*([+-]?)([xyz])[\s,]+([+-]?)([xyz])[\s,]+([+-]?)([xyz])\s*", text)
     rows = [] if found is None else [(found[k] == "-", _AXIS[found[k + 1]]) for k in (1, 3, 5)]
     if sorted(axis for _, axis in rows) != [0, 1, 2]:
-        raise UsageError(f"{where}: {text!r} is not three of x, y, z with their signs, as \"-x +y +z\"")
+        raise UsageError(f'{where}: {text!r} is not three of x, y, z with their signs, as "-x +y +z"')
     return tuple((*(0,) * a, -1 if negative else 1, *(0,) * (2 - a)) for negative, a in rows)  # type: ignore[misc]
 
 
@@ -300,13 +302,18 @@ def reduced(engine: Engine, without: Sequence[str] = (), table: int | None = Non
         raise UsageError(f"without {', '.join(without)} nothing of {engine.name} is left")
     if "sh" in without and any(file.suffix == ".gltf" for file in files):
         raise UsageError("an EXT_lights_image_based has its irradiance coefficients: sh cannot be left out")
-    dfg = msgspec.structs.replace(engine.dfg, charlie=engine.dfg.charlie and "sheen" not in without,
-                                  size=table or engine.dfg.size)
+    dfg = msgspec.structs.replace(
+        engine.dfg, charlie=engine.dfg.charlie and "sheen" not in without, size=table or engine.dfg.size
+    )
     gone = [file.name.replace("{stem}", "STEM") for file in engine.file if file not in files]
-    steps = ["; ".join(part for part in step.split("; ") if not any(name in part for name in gone))
-             for step in engine.steps if not ("sh" in without and "harmonics" in step)]
-    return msgspec.structs.replace(engine, file=files, sh=None if "sh" in without else engine.sh, dfg=dfg,
-                                   steps=tuple(filter(None, steps)))
+    steps = [
+        "; ".join(part for part in step.split("; ") if not any(name in part for name in gone))
+        for step in engine.steps
+        if not ("sh" in without and "harmonics" in step)
+    ]
+    return msgspec.structs.replace(
+        engine, file=files, sh=None if "sh" in without else engine.sh, dfg=dfg, steps=tuple(filter(None, steps))
+    )
 
 
 def check(engine: Engine) -> None:
@@ -317,8 +324,11 @@ def check(engine: Engine) -> None:
     if not engine.file:
         raise UsageError("there is no [[file]]: nothing would be written")
     engine.lods, engine.bend_formula, engine.blend_formula, engine.matrix  # noqa: B018 - each raises for what is no formula or no axes
-    for low, high, what, value in ((1, 4096, "dfg.size", engine.dfg.size), (0, 1, "least", engine.least),
-                                   (1, 16, "levels", engine.levels or 1)):
+    for low, high, what, value in (
+        (1, 4096, "dfg.size", engine.dfg.size),
+        (0, 1, "least", engine.least),
+        (1, 16, "levels", engine.levels or 1),
+    ):
         if not low <= value <= high:
             raise UsageError(f"{what} {value} is outside [{low}, {high}]")
     if (engine.dfg.x == "NoV") == (engine.dfg.y == "NoV"):
@@ -339,11 +349,14 @@ def check(engine: Engine) -> None:
 def _check_file(engine: Engine, file: File, where: str) -> None:
     """Check the format of one file. Raises UsageError."""
     if file.suffix not in SUFFIXES[file.holds]:
-        raise UsageError(f"{where}: {file.holds} is not written as {file.suffix or 'a name without a suffix'}; "
-                         f"{', '.join(SUFFIXES[file.holds])} are")
+        raise UsageError(
+            f"{where}: {file.holds} is not written as {file.suffix or 'a name without a suffix'}; "
+            f"{', '.join(SUFFIXES[file.holds])} are"
+        )
     if file.stored not in FORMATS[file.suffix]:
-        raise UsageError(f"{where}: {file.stored!r} is no format of {file.suffix}"
-                         f"{nearest(file.stored, FORMATS[file.suffix])}")
+        raise UsageError(
+            f"{where}: {file.stored!r} is no format of {file.suffix}{nearest(file.stored, FORMATS[file.suffix])}"
+        )
     if file.zstd is not None and not (file.suffix == ".ktx2" and 1 <= file.zstd <= 22):
         raise UsageError(f"{where}: zstd {file.zstd} is a level from 1 to 22 of .ktx2 files")
     two = file.holds == "dfg" and not engine.dfg.charlie
@@ -351,9 +364,9 @@ def _check_file(engine: Engine, file: File, where: str) -> None:
         raise UsageError(f"{where}: rg16f holds two channels, {file.holds} has more")
     _check_layout(engine, file, where)
     if file.suffix == ".env" and not (engine.whole and engine.sh in ("babylon", None)):
-        raise UsageError(f"{where}: an .env has all mips (whole = true) and sh = \"babylon\"")
+        raise UsageError(f'{where}: an .env has all mips (whole = true) and sh = "babylon"')
     if file.suffix == ".gltf" and engine.sh != "irradiance":
-        raise UsageError(f"{where}: an EXT_lights_image_based needs sh = \"irradiance\"")
+        raise UsageError(f'{where}: an EXT_lights_image_based needs sh = "irradiance"')
     if file.holds == "sh" and engine.sh is None:
         raise UsageError(f"{where}: there is no sh, one of {', '.join(SH_SCALES)}")
 
@@ -363,8 +376,10 @@ def _check_layout(engine: Engine, file: File, where: str) -> None:
     if file.layout == "octahedral" and not (file.holds == "specular" and file.suffix in (".ktx2", ".dds", ".exr")):
         raise UsageError(f"{where}: octahedral maps are of specular, as .ktx2, .dds or .exr")
     if file.layout == "octahedral" and file.suffix != ".exr" and file.border:
-        raise UsageError(f"{where}: levels of a texture halve, with a border they do not; border = 0, or an .exr, "
-                         "which is an atlas of bordered levels")
+        raise UsageError(
+            f"{where}: levels of a texture halve, with a border they do not; border = 0, or an .exr, "
+            "which is an atlas of bordered levels"
+        )
     if file.layout == "octahedral" and engine.axes != "+x +y +z":
         raise UsageError(f"{where}: octahedral maps are in the world's axes: axes cannot be given")
     if file.layout == "cube" and file.holds == "specular" and file.suffix == ".exr":

@@ -1,5 +1,6 @@
 """About twenty lines of GLSL, HLSL or WGSL that read an engine's files as its preset says: the contract between a bake
 and a shader, written out of the same data."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -12,12 +13,23 @@ from whitefurnace.expression import LANGUAGES, Expression
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere.octahedral_map import atlas_places
 
-TYPES = {"glsl": {"float": "float", "vec2": "vec2", "vec3": "vec3", "vec4": "vec4"},
-         "hlsl": {"float": "float", "vec2": "float2", "vec3": "float3", "vec4": "float4"},
-         "wgsl": {"float": "f32", "vec2": "vec2f", "vec3": "vec3f", "vec4": "vec4f"}}
+TYPES = {
+    "glsl": {"float": "float", "vec2": "vec2", "vec3": "vec3", "vec4": "vec4"},
+    "hlsl": {"float": "float", "vec2": "float2", "vec3": "float3", "vec4": "float4"},
+    "wgsl": {"float": "f32", "vec2": "vec2f", "vec3": "vec3f", "vec4": "vec4f"},
+}
 
-MONOMIALS = ("1.0", "d.y", "d.z", "d.x", "d.x * d.y", "d.y * d.z", "(3.0 * d.z * d.z - 1.0)", "d.x * d.z",
-             "(d.x * d.x - d.y * d.y)")
+MONOMIALS = (
+    "1.0",
+    "d.y",
+    "d.z",
+    "d.x",
+    "d.x * d.y",
+    "d.y * d.z",
+    "(3.0 * d.z * d.z - 1.0)",
+    "d.x * d.z",
+    "(d.x * d.x - d.y * d.y)",
+)
 """The basis without its constants, in the order of `harmonic`."""
 
 
@@ -40,10 +52,18 @@ class _Writer:
     def resource(self, kind: str, name: str, told: str) -> None:
         """A texture ("cube", "2d"), the sampler or nine vectors ("sh"), at the next binding of group 0."""
         glsl = {"cube": "uniform samplerCube {};", "2d": "uniform sampler2D {};", "sh": "uniform vec3 {}[9];"}
-        hlsl = {"cube": "TextureCube {};", "2d": "Texture2D {};", "sampler": "SamplerState {};",
-                "sh": "uniform float3 {}[9];"}
-        wgsl = {"cube": "var {}: texture_cube<f32>;", "2d": "var {}: texture_2d<f32>;", "sampler": "var {}: sampler;",
-                "sh": "var<uniform> {}: array<vec3f, 9>;"}
+        hlsl = {
+            "cube": "TextureCube {};",
+            "2d": "Texture2D {};",
+            "sampler": "SamplerState {};",
+            "sh": "uniform float3 {}[9];",
+        }
+        wgsl = {
+            "cube": "var {}: texture_cube<f32>;",
+            "2d": "var {}: texture_2d<f32>;",
+            "sampler": "var {}: sampler;",
+            "sh": "var<uniform> {}: array<vec3f, 9>;",
+        }
         text = {"glsl": glsl, "hlsl": hlsl, "wgsl": wgsl}[self.language].get(kind)
         if text is not None:  # GLSL has the sampler in the texture
             place = f"@group(0) @binding({self.bound}) " if self.language == "wgsl" else ""
@@ -66,8 +86,15 @@ class _Writer:
             return f"{texture}.SampleLevel(linear_clamp, {at}, {lod})"
         return f"textureSampleLevel({texture}, linear_clamp, {at}, {lod})"
 
-    def function(self, result: str, name: str, takes: Sequence[tuple[str, str]],
-                 first: Sequence[tuple[str, str, str]], value: str, told: str = "") -> None:
+    def function(
+        self,
+        result: str,
+        name: str,
+        takes: Sequence[tuple[str, str]],
+        first: Sequence[tuple[str, str, str]],
+        value: str,
+        told: str = "",
+    ) -> None:
         """`first` are (type, name, expression) that `value` may use."""
         if self.language == "wgsl":
             head = f"fn {name}({', '.join(f'{n}: {self.type[t]}' for t, n in takes)}) -> {self.type[result]} {{"
@@ -121,8 +148,11 @@ def _kind(file: File) -> str:
 
 
 def _header(to: _Writer, engine: Engine, levels: int, width: int, stem: str) -> None:
-    to.comment(f"{stem or 'STEM'} as whitefurnace bakes it for {engine.name}: {engine.title}" if engine.title else
-               f"{stem or 'STEM'} as whitefurnace bakes it for {engine.name}")
+    to.comment(
+        f"{stem or 'STEM'} as whitefurnace bakes it for {engine.name}: {engine.title}"
+        if engine.title
+        else f"{stem or 'STEM'} as whitefurnace bakes it for {engine.name}"
+    )
     to.comment(f"{'Proven' if engine.proven else 'Not proven in the engine'}: {engine.facts}.")
     for step in engine.steps:
         to.comment(f"- {step.replace('STEM', stem or 'STEM')}")
@@ -148,8 +178,14 @@ def _resources(to: _Writer, engine: Engine, levels: int, width: int, stem: str) 
     if any(file.stored == "rgbd" for file in (*engine.holding("specular"), *engine.holding("dfg"))):
         # Between codes there is no colour: what is filtered must be decoded.
         power = to.vector("2.2", "2.2", "2.2")
-        to.function("vec3", "decode_rgbd", [("vec4", "code")], [], f"pow(code.rgb, {power}) / code.a",
-                    "once for each texel, before any filter")
+        to.function(
+            "vec3",
+            "decode_rgbd",
+            [("vec4", "code")],
+            [],
+            f"pow(code.rgb, {power}) / code.a",
+            "once for each texel, before any filter",
+        )
 
 
 def _lookup(to: _Writer, engine: Engine, levels: int, width: int) -> None:
@@ -157,14 +193,27 @@ def _lookup(to: _Writer, engine: Engine, levels: int, width: int) -> None:
     lod, bend = engine.lod_formula, engine.bend_formula
     alpha = [("float", "alpha", "r * r")]
     text = lod.shader(language, max_lod=f"{levels - 1}.0", width=f"{width}.0")
-    to.function("float", "specular_lod", [("float", "r")], alpha if "alpha" in lod.used else [],
-                f"clamp({text}, 0.0, {levels - 1}.0)")
+    to.function(
+        "float",
+        "specular_lod",
+        [("float", "r")],
+        alpha if "alpha" in lod.used else [],
+        f"clamp({text}, 0.0, {levels - 1}.0)",
+    )
     mirror = "reflect(-v, n)"
     bent = mirror if _zero(bend) else f"normalize({to.mix(mirror, 'n', bend.shader(language))})"
-    to.function("vec3", "specular_direction", [("vec3", "n"), ("vec3", "v"), ("float", "r")],
-                alpha if "alpha" in bend.used else [], bent)
-    axes = [f"{'-' if row[k] < 0 else ''}d.{'xyz'[k]}" for row in np.asarray(engine.matrix)
-            for k in (int(np.abs(row).argmax()),)]
+    to.function(
+        "vec3",
+        "specular_direction",
+        [("vec3", "n"), ("vec3", "v"), ("float", "r")],
+        alpha if "alpha" in bend.used else [],
+        bent,
+    )
+    axes = [
+        f"{'-' if row[k] < 0 else ''}d.{'xyz'[k]}"
+        for row in np.asarray(engine.matrix)
+        for k in (int(np.abs(row).argmax()),)
+    ]
     to.function("vec3", "stored_direction", [("vec3", "d")], [], to.vector(*axes), "of the world, on the stored cube")
 
 
@@ -179,8 +228,13 @@ def _reads(to: _Writer, engine: Engine) -> None:
         alpha = [("float", "alpha", f"{r} * {r}")]
         if not _zero(blend):
             value = to.mix(value, "irradiance(n)", blend.shader(to.language, r=r))
-        to.function("vec3", f"{name}_radiance", [("vec3", "n"), ("vec3", "v"), ("float", "r")],
-                    alpha if "alpha" in blend.used else [], value)
+        to.function(
+            "vec3",
+            f"{name}_radiance",
+            [("vec3", "n"), ("vec3", "v"), ("float", "r")],
+            alpha if "alpha" in blend.used else [],
+            value,
+        )
 
 
 def _octahedral(to: _Writer, engine: Engine, levels: int, width: int) -> None:
@@ -192,11 +246,22 @@ def _octahedral(to: _Writer, engine: Engine, levels: int, width: int) -> None:
     for along, across in ("xz", "zx"):
         folded = f"(1.0 - abs(a.{across})) * {to.select(f'a.{along} < 0.0', '-1.0', '1.0')}"
         part.append(to.select("a.y < 0.0", folded, f"a.{along}"))
-    to.function("vec2", "octahedral", [("vec3", "d")], [("vec3", "a", "d / (abs(d.x) + abs(d.y) + abs(d.z))")],
-                f"0.5 + 0.5 * {to.vector(*part)}", "on a square of 1")
+    to.function(
+        "vec2",
+        "octahedral",
+        [("vec3", "d")],
+        [("vec3", "a", "d / (abs(d.x) + abs(d.y) + abs(d.z))")],
+        f"0.5 + 0.5 * {to.vector(*part)}",
+        "on a square of 1",
+    )
     if file.suffix != ".exr":
-        to.function("vec3", "specular_map_at", [("vec3", "d"), ("float", "lod")], [],
-                    f"{to.read('specular_map', 'octahedral(d)', 'lod')}.rgb")
+        to.function(
+            "vec3",
+            "specular_map_at",
+            [("vec3", "d"), ("float", "lod")],
+            [],
+            f"{to.read('specular_map', 'octahedral(d)', 'lod')}.rgb",
+        )
         return
     # Level 0 at the left, the others below each other at its right: 1/2 + … + 1/2^(k-1) of `width` is above level k.
     b = file.border
@@ -214,12 +279,21 @@ def _octahedral(to: _Writer, engine: Engine, levels: int, width: int) -> None:
         texel = f"clamp(e * side, {half}, side - {half})"
     corner = f"{to.select('k < 0.5', first, later)} + {texel}"
     at = f"({corner}) / {to.vector(f'{across}.0', f'{down}.0')}"
-    to.function("vec3", "specular_level", [("vec2", "e"), ("float", "k")], [("float", "side", side)],
-                f"{to.read('specular_map', at, '0.0')}.rgb")
+    to.function(
+        "vec3",
+        "specular_level",
+        [("vec2", "e"), ("float", "k")],
+        [("float", "side", side)],
+        f"{to.read('specular_map', at, '0.0')}.rgb",
+    )
     above = f"specular_level(e, {'k + 1.0' if levels > 1 else 'k'})"
-    to.function("vec3", "specular_map_at", [("vec3", "d"), ("float", "lod")],
-                [("vec2", "e", "octahedral(d)"), ("float", "k", f"min(floor(lod), {max(levels - 2, 0)}.0)")],
-                to.mix("specular_level(e, k)", above, "lod - k"))
+    to.function(
+        "vec3",
+        "specular_map_at",
+        [("vec3", "d"), ("float", "lod")],
+        [("vec2", "e", "octahedral(d)"), ("float", "k", f"min(floor(lod), {max(levels - 2, 0)}.0)")],
+        to.mix("specular_level(e, k)", above, "lod - k"),
+    )
 
 
 def _read(to: _Writer, texture: str, file: File, at: str, lod: str) -> str:
@@ -240,23 +314,38 @@ def _irradiance(to: _Writer, engine: Engine) -> None:
     first = [("vec3", "d", "stored_direction(n)")]
     if _rows(engine) is not None and engine.sh == "babylon":
         # What harmonic.babylon inverts: 3/2 and 4 undo the cosine kernel that Babylon.js divides out.
-        value = ("1.5 * (sh[0] * d.x + sh[1] * d.y + sh[2] * d.z)",
-                 "sh[3] * (4.0 * d.x * d.x - 1.0) + sh[4] * (4.0 * d.y * d.y - 1.0) + sh[5] * (4.0 * d.z * d.z - 1.0)",
-                 "4.0 * (sh[6] * d.y * d.z + sh[7] * d.z * d.x + sh[8] * d.x * d.y)")
+        value = (
+            "1.5 * (sh[0] * d.x + sh[1] * d.y + sh[2] * d.z)",
+            "sh[3] * (4.0 * d.x * d.x - 1.0) + sh[4] * (4.0 * d.y * d.y - 1.0) + sh[5] * (4.0 * d.z * d.z - 1.0)",
+            "4.0 * (sh[6] * d.y * d.z + sh[7] * d.z * d.x + sh[8] * d.x * d.y)",
+        )
         to.function("vec3", "irradiance", [("vec3", "n")], first, f"max({_sum(value)}, {zero})", told)
     elif _rows(engine) is not None and engine.sh is not None:
         factors = np.diag(harmonic.unscaled(np.eye(9), engine.sh)) * harmonic.COSINE * harmonic.FACTORS
-        terms = [f"sh[0] * {_number(factors[0])}",
-                 *(f"sh[{k}] * {_times(float(factors[k]), MONOMIALS[k])}" for k in range(1, 9))]
+        terms = [
+            f"sh[0] * {_number(factors[0])}",
+            *(f"sh[{k}] * {_times(float(factors[k]), MONOMIALS[k])}" for k in range(1, 9)),
+        ]
         value = (" + ".join(terms[:4]), " + ".join(terms[4:7]), " + ".join(terms[7:]))
         to.function("vec3", "irradiance", [("vec3", "n")], first, f"max({_sum(value)}, {zero})", told)
     else:
         cube = bool(engine.holding("irradiance"))
         file = engine.holding("irradiance" if cube else "specular")[0]
-        read = _read(to, "irradiance_map" if cube else "specular_map", file, "stored_direction(n)",
-                     "0.0" if cube else "specular_lod(1.0)")
-        to.function("vec3", "irradiance", [("vec3", "n")], [], read,
-                    told if cube else f"{told}, for which the level of r = 1 stands")
+        read = _read(
+            to,
+            "irradiance_map" if cube else "specular_map",
+            file,
+            "stored_direction(n)",
+            "0.0" if cube else "specular_lod(1.0)",
+        )
+        to.function(
+            "vec3",
+            "irradiance",
+            [("vec3", "n")],
+            [],
+            read,
+            told if cube else f"{told}, for which the level of r = 1 stands",
+        )
 
 
 def _sum(parts: Sequence[str]) -> str:
@@ -279,16 +368,31 @@ def _split_sum(to: _Writer, engine: Engine) -> None:
     table = engine.dfg
     least = _least(engine)
     texel = table.size
-    along = {"NoV": f"(sqrt(NoV) * {texel - 1}.0 + 0.5) / {texel}.0" if table.NoV == "sqrt" else "NoV",
-             "roughness": least or "r", "alpha": f"{least or 'r'} * {least or 'r'}"}
+    along = {
+        "NoV": f"(sqrt(NoV) * {texel - 1}.0 + 0.5) / {texel}.0" if table.NoV == "sqrt" else "NoV",
+        "roughness": least or "r",
+        "alpha": f"{least or 'r'} * {least or 'r'}",
+    }
     channels = "rgb" if table.charlie else "rg"
     kind = "vec3" if table.charlie else "vec2"
     at = to.vector(along[table.x], along[table.y])
-    to.function(kind, "dfg", [("float", "NoV"), ("float", "r")], [], f"{to.read('dfg_map', at, '0.0')}.{channels}",
-                {"scale_bias": "(A, B", "multiscatter": "(of Fc, of 1"}[table.form]
-                + (", Charlie's albedo)" if table.charlie else ")"))
+    to.function(
+        kind,
+        "dfg",
+        [("float", "NoV"), ("float", "r")],
+        [],
+        f"{to.read('dfg_map', at, '0.0')}.{channels}",
+        {"scale_bias": "(A, B", "multiscatter": "(of Fc, of 1"}[table.form]
+        + (", Charlie's albedo)" if table.charlie else ")"),
+    )
     scaled = table.form == "scale_bias"
     ones = [to.vector(f"t.{c}", f"t.{c}", f"t.{c}") for c in "xy"]
     value = f"F0 * t.x + {ones[1]}" if scaled else to.mix(ones[0], ones[1], "F0")
-    to.function("vec3", "specular_albedo", [("vec3", "F0"), ("float", "NoV"), ("float", "r")],
-                [(kind, "t", "dfg(NoV, r)")], value, "E of F0, with F90 = 1")
+    to.function(
+        "vec3",
+        "specular_albedo",
+        [("vec3", "F0"), ("float", "NoV"), ("float", "r")],
+        [(kind, "t", "dfg(NoV, r)")],
+        value,
+        "E of F0, with F90 = 1",
+    )

@@ -33,9 +33,24 @@ _READERS: dict[tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 # The exceptions that numpy's header parser and zipfile raise for malformed bytes.
-_NONSENSE = (ValueError, TypeError, SyntaxError, OverflowError, EOFError, MemoryError, RecursionError, LookupError,
-             AttributeError, NotImplementedError, RuntimeError, tokenize.TokenError, struct.error, zlib.error,
-             zipfile.BadZipFile, OSError)
+_NONSENSE = (
+    ValueError,
+    TypeError,
+    SyntaxError,
+    OverflowError,
+    EOFError,
+    MemoryError,
+    RecursionError,
+    LookupError,
+    AttributeError,
+    NotImplementedError,
+    RuntimeError,
+    tokenize.TokenError,
+    struct.error,
+    zlib.error,
+    zipfile.BadZipFile,
+    OSError,
+)
 
 
 def read_npy(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
@@ -95,7 +110,7 @@ def read_header(path: str | os.PathLike[str]) -> npt.NDArray[np.float64] | None:
             return None
         raise source.wrong("it is no C header: it has neither an array of floats nor a macro")
     shape = tuple(int(size) for size in found[1].strip("[]").split("]["))
-    body, end, _ = text[found.end():].partition("};")
+    body, end, _ = text[found.end() :].partition("};")
     numbers = _NUMBER.findall(body)
     if not end or math.prod(shape) != len(numbers):
         raise source.wrong(f"it says that it has {math.prod(shape)} numbers, {len(numbers)} are there")

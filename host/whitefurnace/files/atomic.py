@@ -62,8 +62,9 @@ class Transaction:
     def __enter__(self) -> Transaction:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None,
-                 trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         if self._renamed:  # stopped between renames: the manifest still staged proves the renamed ones ours
             return
         for path in self._targets:
@@ -71,8 +72,9 @@ class Transaction:
                 self.staging(path).unlink()
 
 
-def write_atomic(path: str | os.PathLike[str], writer: Callable[[Path], object],
-                 into: Transaction | None = None) -> None:
+def write_atomic(
+    path: str | os.PathLike[str], writer: Callable[[Path], object], into: Transaction | None = None
+) -> None:
     """Let `writer` write `.NAME.tmp` beside `path`, sync it and rename it to `path`, or stage it in `into`.
 
     Whatever is raised on the way, Ctrl-C too, the temporary file is removed and an existing target is left as
@@ -86,8 +88,9 @@ def write_atomic(path: str | os.PathLike[str], writer: Callable[[Path], object],
         transaction.commit()
 
 
-def write_pieces(path: str | os.PathLike[str], pieces: Iterable[bytes | memoryview],
-                 into: Transaction | None = None) -> None:
+def write_pieces(
+    path: str | os.PathLike[str], pieces: Iterable[bytes | memoryview], into: Transaction | None = None
+) -> None:
     """`write_atomic` of bytes, piece by piece."""
 
     def write(temporary: Path) -> None:

@@ -1,4 +1,5 @@
 """Turns floats into a texture of any pixel format, and a texture into the floats that a GPU reads of it."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -66,8 +67,14 @@ def encode(
             raise ValueError(f"level {k} of shape {array.shape} does not follow level 0 of shape {first.shape}")
         packed.append(_pack(form, array))
     texture = Texture(
-        form, width, height, tuple(p.data.tobytes() for p in packed), first.shape[0] if first.ndim > axes else 0,
-        6 if cube else 1, dict(key_values or {}), orientation,
+        form,
+        width,
+        height,
+        tuple(p.data.tobytes() for p in packed),
+        first.shape[0] if first.ndim > axes else 0,
+        6 if cube else 1,
+        dict(key_values or {}),
+        orientation,
     )
     return Encoded(texture, tuple(p.clipped for p in packed), tuple(p.negative for p in packed))
 

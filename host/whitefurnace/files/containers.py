@@ -46,8 +46,9 @@ def parse_texture(source: Source) -> Texture:
     raise InputError(f"{source.name} is not a texture in a container that is known: KTX 1, KTX 2 or DDS")
 
 
-def write_texture(path: str | os.PathLike[str], texture: Texture, *, zstd: int | None = None,
-                  into: Transaction | None = None) -> None:
+def write_texture(
+    path: str | os.PathLike[str], texture: Texture, *, zstd: int | None = None, into: Transaction | None = None
+) -> None:
     """Write `texture` as .ktx, .ktx2 or .dds, by the suffix of `path`.
 
     zstd: level of Zstandard compression, 1 to 22, for .ktx2 alone. into: the transaction that the file belongs to.

@@ -121,10 +121,33 @@ def _file(texture: Texture) -> Iterator[Buffer]:
         caps2 = _CAPS2_CUBE | _CAPS2_FACES
     # Bytes of a row of level 0; for block formats, bytes of the whole image.
     pitch = level_bytes(texture.format, texture.width, texture.height if kind.block > 1 else 1, 0)
-    yield MAGIC + struct.pack("<31I", 124, flags, texture.height, texture.width, pitch, 0, count, *[0] * 11,
-                              32, _FOURCC, _DX10, 0, 0, 0, 0, 0, caps, caps2, 0, 0, 0)
-    yield struct.pack("<5I", _DXGI[texture.format], _TEXTURE2D, _MISC_CUBE if texture.cube else 0,
-                      max(texture.layers, 1), 0)
+    yield MAGIC + struct.pack(
+        "<31I",
+        124,
+        flags,
+        texture.height,
+        texture.width,
+        pitch,
+        0,
+        count,
+        *[0] * 11,
+        32,
+        _FOURCC,
+        _DX10,
+        0,
+        0,
+        0,
+        0,
+        0,
+        caps,
+        caps2,
+        0,
+        0,
+        0,
+    )
+    yield struct.pack(
+        "<5I", _DXGI[texture.format], _TEXTURE2D, _MISC_CUBE if texture.cube else 0, max(texture.layers, 1), 0
+    )
     for image in range(images):
         for k, level in enumerate(texture.levels):
             size = texture.level_bytes(k) // images

@@ -99,9 +99,13 @@ def env_bytes(envmap: EnvMap) -> tuple[bytes, int, int]:
         irradiance = dict(zip(POLYNOMIALS, rows, strict=True))
         if envmap.irradiance is not None:
             irradiance["irradianceTexture"] = {"size": envmap.irradiance.shape[1], "faces": places[len(specular) :]} | (
-                {} if envmap.dominant is None else {"dominantDirection": list(envmap.dominant)})
+                {} if envmap.dominant is None else {"dominantDirection": list(envmap.dominant)}
+            )
     manifest = {
-        "version": VERSION, "width": envmap.size, "imageType": "image/png", "irradiance": irradiance,
+        "version": VERSION,
+        "width": envmap.size,
+        "imageType": "image/png",
+        "irradiance": irradiance,
         "specular": {"mipmaps": specular, "lodGenerationScale": envmap.lod_scale},
     }
     text = json.dumps(manifest, separators=(",", ":"), allow_nan=False)
@@ -166,8 +170,9 @@ def parse_env(source: Source) -> EnvMap:
         piece = Source(source.piece(at, size, name), f"{source.name}, {name},")
         faces.append(decode_face(piece, sides[k]))
     cubes = [np.stack(faces[k : k + 6]) for k in range(0, len(faces), 6)]
-    return EnvMap(tuple(cubes[:count]), polynomials, cubes[count] if side else None, scale, dominant, version,
-                  image_type)
+    return EnvMap(
+        tuple(cubes[:count]), polynomials, cubes[count] if side else None, scale, dominant, version, image_type
+    )
 
 
 def _spans(take: Reader, value: Any, what: str, count: int, start: int) -> list[tuple[int, int]]:

@@ -34,9 +34,7 @@ def write_exr(
     path = Path(path)
     pixels = np.ascontiguousarray(pixels, np.float32)
     if pixels.ndim != 3 or pixels.shape[2] != len(channel_names):
-        raise ValueError(
-            f"pixels of shape {pixels.shape} do not have one channel a name of {tuple(channel_names)}"
-        )
+        raise ValueError(f"pixels of shape {pixels.shape} do not have one channel a name of {tuple(channel_names)}")
 
     def write(temporary: Path) -> None:
         # Open the file here first: OpenImageIO does not pass on the system's reason for a failure.
@@ -47,9 +45,7 @@ def write_exr(
             if complaint is None and not _holds(temporary, pixels):
                 complaint = "what was written does not read back, the disk may be full"
         except UnicodeError as error:
-            raise FileError(
-                f"cannot write {str(path)!r}: its name or an attribute is not valid Unicode"
-            ) from error
+            raise FileError(f"cannot write {str(path)!r}: its name or an attribute is not valid Unicode") from error
         if complaint is not None:
             raise FileError(f"cannot write {path}: {complaint}")
 
@@ -121,8 +117,4 @@ def _holds(path: Path, pixels: npt.NDArray[np.float32]) -> bool:
 
 def _first_line(complaint: str) -> str:
     lines = complaint.strip().splitlines()
-    return (
-        " ".join(lines[0].split())[:160].rstrip(".")
-        if lines
-        else "OpenImageIO gave no reason, the disk may be full"
-    )
+    return " ".join(lines[0].split())[:160].rstrip(".") if lines else "OpenImageIO gave no reason, the disk may be full"

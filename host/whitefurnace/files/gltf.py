@@ -78,8 +78,10 @@ class Gltf:
         kind = self.take.text(one.get("type"), f"the type of {name}")
         component = self.take.whole(one.get("componentType"), f"componentType of {name}", 0, 1 << 16)
         if kind not in types or component not in COMPONENTS:
-            raise self.source.wrong(f"{name}, {what}, is of {kind[:20]} and componentType {component}; "
-                                    f"{' or '.join(types)} of {', '.join(map(str, COMPONENTS))} were expected")
+            raise self.source.wrong(
+                f"{name}, {what}, is of {kind[:20]} and componentType {component}; "
+                f"{' or '.join(types)} of {', '.join(map(str, COMPONENTS))} were expected"
+            )
         count = self.take.whole(one.get("count"), f"count of {name}", 1, MAX_ELEMENTS)
         dtype, n = np.dtype(COMPONENTS[component]), TYPES[kind]
         if "bufferView" not in one or "sparse" in one:
@@ -92,8 +94,10 @@ class Gltf:
         offset = self.take.whole(one.get("byteOffset", 0), f"byteOffset of {name}", 0, 1 << 40)
         end = offset + stride * (count - 1) + n * dtype.itemsize
         if stride < n * dtype.itemsize or end > len(data):
-            raise self.source.wrong(f"{name}, {what}, has {count} elements of {n * dtype.itemsize} bytes, {stride} "
-                                    f"apart, up to byte {end} of a bufferView of {len(data)}")
+            raise self.source.wrong(
+                f"{name}, {what}, has {count} elements of {n * dtype.itemsize} bytes, {stride} "
+                f"apart, up to byte {end} of a bufferView of {len(data)}"
+            )
         values = np.ndarray((count, n), dtype, data, offset, (stride, dtype.itemsize))
         if one.get("normalized") is True and dtype.kind != "f":
             return np.maximum(values / np.float64(np.iinfo(dtype).max), -1.0)
@@ -186,8 +190,10 @@ def _decoded(path: Path, size: int) -> Iterator[tuple[int, int, int, Codes]]:
         _check_size(spec, path, size, source.format_name())
         height, width, channels = spec.height, spec.width, spec.nchannels
         if channels not in (1, 2, 3, 4) or height * width > MAX_PIXELS // 4:
-            raise InputError(f"{path} has {width} x {height} pixels of {channels} channels; textures of 1 to 4 and at "
-                             f"most {MAX_PIXELS // 4} pixels are read")
+            raise InputError(
+                f"{path} has {width} x {height} pixels of {channels} channels; textures of 1 to 4 and at "
+                f"most {MAX_PIXELS // 4} pixels are read"
+            )
         kind = "uint16" if str(spec.format) == "uint16" else "uint8"
         rows = max(1, _BAND // (width * channels * 2))
         for y in range(0, height, rows):

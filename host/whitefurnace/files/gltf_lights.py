@@ -66,8 +66,9 @@ class GltfLight:
         return self.levels[0].shape[1]
 
 
-def write_gltf_lights(path: str | os.PathLike[str], light: GltfLight | Sequence[GltfLight], *,
-                      into: Transaction | None = None) -> tuple[int, int]:
+def write_gltf_lights(
+    path: str | os.PathLike[str], light: GltfLight | Sequence[GltfLight], *, into: Transaction | None = None
+) -> tuple[int, int]:
     """Write one .gltf with the images inside; scene k is lit by light k. The same lights give the same bytes.
 
     Returns the number of values clipped to 255, the largest that RGBD holds, and the number of negative values set
@@ -92,14 +93,16 @@ def gltf_text(lights: Sequence[GltfLight]) -> tuple[str, int, int]:
             clipped, negative = clipped + over, negative + below
             mips.append(list(range(len(images), len(images) + 6)))
             images += [{"uri": f"{_DATA}image/png;base64,{base64.b64encode(face).decode()}"} for face in faces]
-        entries.append({
-            **({"name": light.name} if light.name else {}),
-            "rotation": list(light.rotation),
-            "intensity": light.intensity,  # always written: without it Babylon.js multiplies by undefined, which is NaN
-            "irradianceCoefficients": np.asarray(light.coefficients, np.float64).tolist(),
-            "specularImageSize": light.size,
-            "specularImages": mips,
-        })
+        entries.append(
+            {
+                **({"name": light.name} if light.name else {}),
+                "rotation": list(light.rotation),
+                "intensity": light.intensity,  # always written: without it Babylon.js multiplies by undefined, which is NaN
+                "irradianceCoefficients": np.asarray(light.coefficients, np.float64).tolist(),
+                "specularImageSize": light.size,
+                "specularImages": mips,
+            }
+        )
     document = {
         "asset": {"version": "2.0", "generator": "whitefurnace"},
         "extensionsUsed": [NAME],
@@ -141,15 +144,23 @@ def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfL
     for k, (light, size, mips) in enumerate(entries):
         what = f"light {k}"
         coefficients = take.rows(light.get("irradianceCoefficients"), f"irradianceCoefficients of {what}", 9)
-        x, y, z, w = [take.number(value, f"a number of rotation of {what}")
-                      for value in take.array(light.get("rotation", [0, 0, 0, 1]), f"rotation of {what}", 4, 4)]
+        x, y, z, w = [
+            take.number(value, f"a number of rotation of {what}")
+            for value in take.array(light.get("rotation", [0, 0, 0, 1]), f"rotation of {what}", 4, 4)
+        ]
         intensity = take.number(light.get("intensity", 1), f"intensity of {what}")
         name = take.text(light.get("name", ""), f"name of {what}")
         levels = []
         for mip, faces in enumerate(mips):
             six = take.array(faces, f"mip {mip} of {what}", 6, 6)
-            levels.append(np.stack([images.face(index, size >> mip, f"face {face} of mip {mip} of {what}")
-                                    for face, index in enumerate(six)]))
+            levels.append(
+                np.stack(
+                    [
+                        images.face(index, size >> mip, f"face {face} of mip {mip} of {what}")
+                        for face, index in enumerate(six)
+                    ]
+                )
+            )
         lights.append(GltfLight(tuple(levels), coefficients, (x, y, z, w), intensity, name))
     return tuple(lights)
 
@@ -205,8 +216,9 @@ def _json(source: Source, data: memoryview) -> dict[str, Any]:
 class _Images:
     """Images of a glTF by index. Each image is decoded once, and each buffer or file is loaded once."""
 
-    def __init__(self, take: Reader, document: Mapping[str, Any], binary: memoryview | None,
-                 folder: Path | None) -> None:
+    def __init__(
+        self, take: Reader, document: Mapping[str, Any], binary: memoryview | None, folder: Path | None
+    ) -> None:
         self._take, self._source, self._binary, self._folder = take, take.source, binary, folder
         self._images = take.array(document.get("images", []), "images", 0, MAX_IMAGES)
         self._views = take.array(document.get("bufferViews", []), "bufferViews", 0, MAX_IMAGES)

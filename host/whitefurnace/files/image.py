@@ -59,9 +59,7 @@ def srgb_table(dtype: str) -> npt.NDArray[np.float32]:
     return linear.astype(np.float32)
 
 
-def decode_srgb(
-    codes: npt.NDArray[Any], out: npt.NDArray[np.float32] | None = None
-) -> npt.NDArray[np.float32]:
+def decode_srgb(codes: npt.NDArray[Any], out: npt.NDArray[np.float32] | None = None) -> npt.NDArray[np.float32]:
     """Decode uint8 or uint16 `codes` (..., 1 | 3 | 4) from sRGB to linear float32.
 
     A fourth channel is not decoded but divided by its largest code. `out` receives the result where it is given.
@@ -131,9 +129,7 @@ def _read(path: Path, size: int, digest: str) -> Image:
     complaint = _complaint(oiio)  # fetched even without a failure: else it is printed at exit
     if source is None:
         if "could not find a format reader" in complaint or not complaint:
-            raise InputError(
-                f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG"
-            )
+            raise InputError(f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG")
         raise InputError(f"{path} is not a valid image: {_reason(complaint, path)}")
     try:
         return _decode(source, path, size, digest, head, notices)
@@ -152,9 +148,7 @@ def _decode(source: Any, path: Path, size: int, digest: str, head: bytes, notice
     pixel = str(spec.format)
     # Channels of an EXR may differ in type; OpenImageIO converts all to the type of the first.
     if pixel not in ("uint8", "uint16", "half", "float", "double"):
-        raise InputError(
-            f"{path} has pixels of type {pixel}, 8- or 16-bit unsigned integers or floats were expected"
-        )
+        raise InputError(f"{path} has pixels of type {pixel}, 8- or 16-bit unsigned integers or floats were expected")
     pixels = _read_pixels(source, spec, picks, path, pixel)
     colour_space = str(spec.get_string_attribute("oiio:ColorSpace"))
     if pixel in ("uint8", "uint16") and form != "pnm" and colour_space and "srgb" not in colour_space.lower():
@@ -165,9 +159,7 @@ def _decode(source: Any, path: Path, size: int, digest: str, head: bytes, notice
     if form == "hdr" and stated != 1.0:
         notices.append(f"{path}: states EXPOSURE={stated:g}, which was not applied")
     if int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
-        notices.append(
-            f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read"
-        )
+        notices.append(f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read")
     primaries = _primaries(spec, form, head)
     if primaries is not None and pixels.shape[2] >= 3:
         _to_rec709(pixels, primaries, path, notices)
@@ -189,8 +181,7 @@ def _check_size(spec: Any, path: Path, size: int, form: str) -> None:
         )
     if spec.tile_width and max(spec.tile_width, spec.tile_height) > MAX_SIDE:
         raise InputError(
-            f"{path} states tiles of {spec.tile_width} x {spec.tile_height}, "
-            f"at most {MAX_SIDE} a side are read"
+            f"{path} states tiles of {spec.tile_width} x {spec.tile_height}, at most {MAX_SIDE} a side are read"
         )
     if form in ("tiff", "png", "jpeg") and spec.image_bytes(True) > _MAX_RATIO * size:
         raise InputError(
@@ -223,9 +214,7 @@ def _pick_channels(names: list[str], path: Path, form: str, notices: list[str]) 
     elif all(name in found for name in "RGB"):
         picks = [found[name] for name in "RGBA" if name in found]
     elif "RY" in found or "BY" in found:
-        raise InputError(
-            f"{path} stores luminance and chroma ({', '.join(names)}), channels R, G and B were expected"
-        )
+        raise InputError(f"{path} stores luminance and chroma ({', '.join(names)}), channels R, G and B were expected")
     elif "Y" in found:
         picks = [found["Y"]]
     elif form != "openexr" and len(names) in (3, 4):
@@ -261,9 +250,7 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
     for y in range(spec.y + (begin - spec.y) // unit * unit, end, rows):
         stop = min(y + rows, spec.y + spec.height)
         if tile:
-            band = source.read_tiles(
-                0, 0, spec.x, spec.x + spec.width, y, stop, spec.z, spec.z + 1, first, last, kind
-            )
+            band = source.read_tiles(0, 0, spec.x, spec.x + spec.width, y, stop, spec.z, spec.z + 1, first, last, kind)
         else:
             band = source.read_scanlines(0, 0, y, stop, spec.z, first, last, kind)
         # OpenImageIO fills missing parts of a JPEG with grey and only sets an error message.
@@ -306,9 +293,7 @@ def _rgb_to_xyz(primaries: tuple[float, ...]) -> npt.NDArray[np.float64]:
     return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
 
 
-def _to_rec709(
-    pixels: npt.NDArray[np.float32], primaries: tuple[float, ...], path: Path, notices: list[str]
-) -> None:
+def _to_rec709(pixels: npt.NDArray[np.float32], primaries: tuple[float, ...], path: Path, notices: list[str]) -> None:
     """Convert `pixels` (height, width, 3 | 4) to Rec.709 in place.
 
     The matrix is Rec.709⁻¹ · Bradford⁻¹ · diag(white ratio) · Bradford · source.

@@ -36,9 +36,7 @@ def _check_png(path: Path, size: int, notices: list[str]) -> None:
             file.seek(start)
             head = file.read(8)
             if len(head) < 8:
-                raise InputError(
-                    f"{path} is truncated: its PNG data ends at byte {size} without an end marker"
-                )
+                raise InputError(f"{path} is truncated: its PNG data ends at byte {size} without an end marker")
             length, kind = struct.unpack(">I4s", head)
             if start + 12 + length > size:
                 raise InputError(
@@ -50,9 +48,7 @@ def _check_png(path: Path, size: int, notices: list[str]) -> None:
             while left and (block := file.read(min(left, 1 << 20))):
                 checksum, left = zlib.crc32(block, checksum), left - len(block)
             if checksum != int.from_bytes(file.read(4), "big"):
-                raise InputError(
-                    f"{path} is corrupted: the PNG chunk at byte {start} does not match its checksum"
-                )
+                raise InputError(f"{path} is corrupted: the PNG chunk at byte {start} does not match its checksum")
             if kind == b"gAMA" and length == 4 and abs(int.from_bytes(first, "big") - 45455) > 500:
                 notices.append(
                     f"{path}: states a gamma of {int.from_bytes(first, 'big') / 1e5:g}, its integers were "

@@ -140,7 +140,11 @@ def _orientation(source: Source, value: bytes) -> str:
     parts = value.rstrip(b"\0").split(b",")
     short = b"".join(part[2:] for part in parts)
     if [part[:2] for part in parts] not in ([b"S=", b"T="], [b"S=", b"T=", b"R="]) or short[:2] not in (
-            b"rd", b"ru", b"ld", b"lu"):
+        b"rd",
+        b"ru",
+        b"ld",
+        b"lu",
+    ):
         raise source.wrong("its KTXorientation is not of the form S=r,T=d (r or l, d or u)")
     return short[:2].decode()
 
@@ -155,10 +159,21 @@ def _pieces(texture: Texture) -> Iterator[Buffer]:
 
 
 def _file(texture: Texture, codes: _Codes, keys: bytes) -> Iterator[Buffer]:
-    yield IDENTIFIER + _HEADER.pack(
-        _ENDIANNESS, *codes, texture.width, texture.height, 0, texture.layers, texture.faces, len(texture.levels),
-        len(keys),
-    ) + keys
+    yield (
+        IDENTIFIER
+        + _HEADER.pack(
+            _ENDIANNESS,
+            *codes,
+            texture.width,
+            texture.height,
+            0,
+            texture.layers,
+            texture.faces,
+            len(texture.levels),
+            len(keys),
+        )
+        + keys
+    )
     for k, level in enumerate(texture.levels):
         row, padded, rows = _rows(texture.format, texture.width, texture.height, k, texture.layers, texture.faces)
         total = padded * rows

@@ -58,13 +58,23 @@ _KINDS = {
     "rgb16f": _unpacked(90, 3, 16),
     "rgba16f": _unpacked(97, 4, 16),
     "rgba32f": _unpacked(109, 4, 32),
-    "b10g11r11": _Kind(122, 4, _RGBSDA, (
-        (0, 11, 0 | _FLOAT, 0, _ONE), (11, 11, 1 | _FLOAT, 0, _ONE), (22, 10, 2 | _FLOAT, 0, _ONE),
-    )),
+    "b10g11r11": _Kind(
+        122,
+        4,
+        _RGBSDA,
+        (
+            (0, 11, 0 | _FLOAT, 0, _ONE),
+            (11, 11, 1 | _FLOAT, 0, _ONE),
+            (22, 10, 2 | _FLOAT, 0, _ONE),
+        ),
+    ),
     # The ranges of the samples are those that Khronos' dfdutils write for this format.
-    "rgb9e5": _Kind(123, 4, _RGBSDA, tuple(
-        sample for c in range(3) for sample in ((9 * c, 9, c, 0, 8448), (27, 5, c | _EXPONENT, 15, 31))
-    )),
+    "rgb9e5": _Kind(
+        123,
+        4,
+        _RGBSDA,
+        tuple(sample for c in range(3) for sample in ((9 * c, 9, c, 0, 8448), (27, 5, c | _EXPONENT, 15, 31))),
+    ),
     "bc6hu": _Kind(143, 1, _BC6H, ((0, 128, 0 | _FLOAT, 0, _ONE),)),
     "bc6hs": _Kind(144, 1, _BC6H, ((0, 128, 0 | _FLOAT | _SIGNED, _MINUS_ONE, _ONE),)),
     "astc4x4hdr": _Kind(1000066000, 1, _ASTC, ((0, 128, 0 | _FLOAT | _SIGNED, _MINUS_ONE, _ONE),)),
@@ -72,8 +82,9 @@ _KINDS = {
 _BY_VK = {kind.vk: name for name, kind in _KINDS.items()}
 
 
-def write_ktx2(path: str | os.PathLike[str], texture: Texture, *, zstd: int | None = None,
-               into: Transaction | None = None) -> None:
+def write_ktx2(
+    path: str | os.PathLike[str], texture: Texture, *, zstd: int | None = None, into: Transaction | None = None
+) -> None:
     """Write `texture` as KTX 2; the same texture gives the same bytes.
 
     zstd: level of Zstandard compression, 1 to 22; None for none. The key KTXwriter is `whitefurnace` unless
@@ -100,8 +111,23 @@ def parse_ktx2(source: Source) -> Texture:
     """Parse the bytes of a KTX 2 file. Raises `InputError` where they are not valid."""
     if source.piece(0, 12, "the KTX 2 identifier") != IDENTIFIER:
         raise source.wrong("it does not begin with the identifier of KTX 2")
-    (vk, type_size, width, height, depth, layers, faces, levels, scheme,
-     dfd_at, dfd_bytes, kvd_at, kvd_bytes, _, sgd_bytes) = source.integers("9I4I2Q", 12, "the KTX 2 header")
+    (
+        vk,
+        type_size,
+        width,
+        height,
+        depth,
+        layers,
+        faces,
+        levels,
+        scheme,
+        dfd_at,
+        dfd_bytes,
+        kvd_at,
+        kvd_bytes,
+        _,
+        sgd_bytes,
+    ) = source.integers("9I4I2Q", 12, "the KTX 2 header")
     name = _BY_VK.get(vk)
     if name is None:
         known = ", ".join(f"{kind.vk} ({name})" for name, kind in _KINDS.items())
@@ -190,9 +216,13 @@ def _pieces(texture: Texture, zstd: int | None) -> Iterator[Buffer]:
 
 def _file(texture: Texture, zstd: int | None) -> Iterator[Buffer]:
     kind, form = _KINDS[texture.format], FORMATS[texture.format]
-    keys = pack_key_values({
-        "KTXwriter": text_value(WRITER), **texture.key_values, _ORIENTATION: text_value(texture.orientation),
-    })
+    keys = pack_key_values(
+        {
+            "KTXwriter": text_value(WRITER),
+            **texture.key_values,
+            _ORIENTATION: text_value(texture.orientation),
+        }
+    )
     descriptor = data_format_descriptor(texture.format)
     count = len(texture.levels)
     dfd_at = len(IDENTIFIER) + _HEADER.size + count * _LEVEL.size
@@ -210,8 +240,21 @@ def _file(texture: Texture, zstd: int | None) -> Iterator[Buffer]:
         index[k] = _LEVEL.pack(at, len(stored[k]), memoryview(texture.levels[k]).nbytes)
         at += len(stored[k])
     yield IDENTIFIER + _HEADER.pack(
-        kind.vk, kind.type_size, texture.width, texture.height, 0, texture.layers, texture.faces, count,
-        _NONE if zstd is None else _ZSTD, dfd_at, len(descriptor), kvd_at, len(keys), 0, 0,
+        kind.vk,
+        kind.type_size,
+        texture.width,
+        texture.height,
+        0,
+        texture.layers,
+        texture.faces,
+        count,
+        _NONE if zstd is None else _ZSTD,
+        dfd_at,
+        len(descriptor),
+        kvd_at,
+        len(keys),
+        0,
+        0,
     )
     yield b"".join(index) + descriptor + keys
     yield from body

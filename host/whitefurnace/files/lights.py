@@ -101,12 +101,19 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
     levels: tuple[Texels, ...] = ()
     undecoded = ""
     try:
-        levels = tuple(upright(decode(texture, k), texture.orientation)
-                       for k in range(1 if first else len(texture.levels)))
+        levels = tuple(
+            upright(decode(texture, k), texture.orientation) for k in range(1 if first else len(texture.levels))
+        )
     except UnsupportedError as error:
         undecoded = str(error)
-    facts: dict[str, str | int] = {"width": texture.width, "height": texture.height, "mips": len(texture.levels),
-                                   "layers": texture.layers, "faces": texture.faces, "bytes": len(source)}
+    facts: dict[str, str | int] = {
+        "width": texture.width,
+        "height": texture.height,
+        "mips": len(texture.levels),
+        "layers": texture.layers,
+        "faces": texture.faces,
+        "bytes": len(source),
+    }
     stored = tuple(memoryview(level).nbytes for level in texture.levels)
     container = "DDS"
     if bytes(data[:12]) == ktx2.IDENTIFIER:
@@ -118,13 +125,23 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
         container = "KTX 1"
         # Filament's loader accepts 0x8C3A as type and format too, where GL has 0x8C3B and RGB.
         facts["glType"], _, facts["glFormat"], facts["glInternalFormat"] = (
-            f"{code:#06x}" for code in struct.unpack_from("<4I", data, 16))
+            f"{code:#06x}" for code in struct.unpack_from("<4I", data, 16)
+        )
     if texture.orientation != "rd":
         facts["orientation"] = texture.orientation
     title = f"{texture.format} ({FORMATS[texture.format].title})"
-    return Light(container, title, texture.cube, texture.layers, levels, stored, _largest(texture),
-                 facts, {key: _text(value) for key, value in texture.key_values.items()},
-                 undecoded=undecoded)
+    return Light(
+        container,
+        title,
+        texture.cube,
+        texture.layers,
+        levels,
+        stored,
+        _largest(texture),
+        facts,
+        {key: _text(value) for key, value in texture.key_values.items()},
+        undecoded=undecoded,
+    )
 
 
 def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool]:
@@ -146,31 +163,61 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool]:
 
 def _env(source: Source) -> Light:
     found = parse_env(source)
-    text = bytes(source.view[len(ENV_MAGIC):]).partition(b"\0")[0]
+    text = bytes(source.view[len(ENV_MAGIC) :]).partition(b"\0")[0]
     lengths = [image["length"] for image in json.loads(text.decode("latin-1"))["specular"]["mipmaps"]]
     count = len(found.levels)
     # lod = scale · log2(size · α); roughness that gives a negative lod reads level 0.
     roughness = (0.0, *(math.sqrt(2 ** (k / found.lod_scale) / found.size) for k in range(1, count)))
-    facts: dict[str, str | int] = {"width": found.size, "mips": count, "version": found.version,
-                                   "images": found.image_type, "lodGenerationScale": f"{found.lod_scale:g}",
-                                   "bytes": len(source)}
-    return Light("Babylon .env", f"rgbd ({FORMATS['rgbd'].title})", True, 0, found.levels,
-                 tuple(sum(lengths[6 * k:6 * k + 6]) for k in range(count)), (FORMATS["rgbd"].largest,) * 3, facts,
-                 polynomials=found.polynomials, irradiance=found.irradiance, roughness=roughness)
+    facts: dict[str, str | int] = {
+        "width": found.size,
+        "mips": count,
+        "version": found.version,
+        "images": found.image_type,
+        "lodGenerationScale": f"{found.lod_scale:g}",
+        "bytes": len(source),
+    }
+    return Light(
+        "Babylon .env",
+        f"rgbd ({FORMATS['rgbd'].title})",
+        True,
+        0,
+        found.levels,
+        tuple(sum(lengths[6 * k : 6 * k + 6]) for k in range(count)),
+        (FORMATS["rgbd"].largest,) * 3,
+        facts,
+        polynomials=found.polynomials,
+        irradiance=found.irradiance,
+        roughness=roughness,
+    )
 
 
 def _gltf(path: Path) -> Light:
     lights = read_gltf_lights(path)
     found, count = lights[0], len(lights[0].levels)
-    facts: dict[str, str | int] = {"width": found.size, "mips": count, "lights": len(lights),
-                                   "intensity": f"{found.intensity:g}", "bytes": path.stat().st_size}
+    facts: dict[str, str | int] = {
+        "width": found.size,
+        "mips": count,
+        "lights": len(lights),
+        "intensity": f"{found.intensity:g}",
+        "bytes": path.stat().st_size,
+    }
     if found.name:
         facts["name"] = found.name
     if found.rotation != (0.0, 0.0, 0.0, 1.0):
         facts["rotation"] = " ".join(f"{x:g}" for x in found.rotation)
     roughness = tuple(k / (count - 1) for k in range(count)) if count > 1 else None
-    return Light("glTF", f"rgbd ({FORMATS['rgbd'].title}), EXT_lights_image_based", True, 0, found.levels, (),
-                 (FORMATS["rgbd"].largest,) * 3, facts, roughness=roughness, irradiance_sh=found.coefficients)
+    return Light(
+        "glTF",
+        f"rgbd ({FORMATS['rgbd'].title}), EXT_lights_image_based",
+        True,
+        0,
+        found.levels,
+        (),
+        (FORMATS["rgbd"].largest,) * 3,
+        facts,
+        roughness=roughness,
+        irradiance_sh=found.coefficients,
+    )
 
 
 def light_files(path: str | os.PathLike[str]) -> list[Path]:

@@ -92,8 +92,15 @@ def acquire(path: Path, *, wait: bool = True, folder: bool = False) -> Lock | No
             if folder:
                 path.parent.mkdir(parents=True, exist_ok=True)
             # Not through a symbolic link: what is written would land where it points.
-            handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
-                             | getattr(os, "O_NONBLOCK", 0), 0o666)
+            handle = os.open(
+                path,
+                os.O_RDWR
+                | os.O_CREAT
+                | getattr(os, "O_NOFOLLOW", 0)
+                | getattr(os, "O_BINARY", 0)
+                | getattr(os, "O_NONBLOCK", 0),
+                0o666,
+            )
         except FileNotFoundError as error:  # a run that failed removed the empty folder just now
             missing += 1
             if not folder or missing == 10:

@@ -32,8 +32,9 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
     return found if isinstance(found, dict) and "whitefurnace" in found else None
 
 
-def write_manifest(path: str | os.PathLike[str], manifest: Mapping[str, Any], *,
-                   into: Transaction | None = None) -> None:
+def write_manifest(
+    path: str | os.PathLike[str], manifest: Mapping[str, Any], *, into: Transaction | None = None
+) -> None:
     """Write `manifest` as indented JSON with sorted keys. It must have the key `whitefurnace` (the version)
     and hold finite numbers only. Raises `FileError` for what cannot be written."""
     if "whitefurnace" not in manifest:

@@ -23,8 +23,14 @@ from whitefurnace.files.atomic import Transaction, write_atomic
 Fill = Callable[[npt.NDArray[Any]], object]
 
 
-def write_npy(path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DTypeLike, fill: Fill, *,
-              into: Transaction | None = None) -> None:
+def write_npy(
+    path: str | os.PathLike[str],
+    shape: Sequence[int],
+    dtype: npt.DTypeLike,
+    fill: Fill,
+    *,
+    into: Transaction | None = None,
+) -> None:
     """Write a .npy array of `shape` and `dtype` that `fill` fills in place.
 
     A failure leaves no file behind. Raises `FileError` where the file cannot be written, for example on a full disk;
@@ -44,8 +50,9 @@ def write_npy(path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DTy
 
 
 @contextlib.contextmanager
-def scratch(path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DTypeLike,
-            fill: Fill) -> Iterator[npt.NDArray[Any]]:
+def scratch(
+    path: str | os.PathLike[str], shape: Sequence[int], dtype: npt.DTypeLike, fill: Fill
+) -> Iterator[npt.NDArray[Any]]:
     """Give an array filled by `fill`, in a nameless temporary file in the folder of `path`. Raises `FileError`."""
     path = Path(path)
     with contextlib.ExitStack() as stack:

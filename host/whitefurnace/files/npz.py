@@ -14,8 +14,9 @@ import numpy.typing as npt
 from whitefurnace.files.atomic import Transaction, write_atomic
 
 
-def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, npt.ArrayLike], *,
-              into: Transaction | None = None) -> None:
+def write_npz(
+    path: str | os.PathLike[str], arrays: Mapping[str, npt.ArrayLike], *, into: Transaction | None = None
+) -> None:
     """Write `arrays` by name as .npz, uncompressed and in their order.
 
     A failure leaves no file behind. Raises `FileError` where the file cannot be written, for example on a full disk.

@@ -5,6 +5,7 @@ holds its lock. A `Transaction` renames the files first and the manifest last; a
 leaves the manifest staged, which tells the next run whose the files are. Bakes and tables differ only in the form of
 their manifests: `FolderOutput` and `FileOutput`.
 """
+
 from __future__ import annotations
 
 import contextlib
@@ -186,8 +187,11 @@ class FolderOutput(Output):
 
     def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
         for files in (manifest.get("files"), manifest.get("kept", {})):
-            if not (isinstance(files, dict) and all(isinstance(entry, dict) for entry in files.values())
-                    and all(is_safe(name) for name in files)):
+            if not (
+                isinstance(files, dict)
+                and all(isinstance(entry, dict) for entry in files.values())
+                and all(is_safe(name) for name in files)
+            ):
                 return None
         return {name: entry.get("sha256") for name, entry in manifest["files"].items()}
 

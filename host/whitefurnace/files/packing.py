@@ -122,8 +122,9 @@ def pack(name: str, values: npt.ArrayLike) -> Packed:
     return Packed(data.reshape(*array.shape[:-1], kind.size), clipped, negative)
 
 
-def unpack(name: str, data: bytes | memoryview | npt.NDArray[np.uint8], shape: tuple[int, ...]) -> npt.NDArray[
-        np.float32]:
+def unpack(
+    name: str, data: bytes | memoryview | npt.NDArray[np.uint8], shape: tuple[int, ...]
+) -> npt.NDArray[np.float32]:
     """Decode `data` as a GPU does, to float32 (*shape, channels).
 
     The result is exact, except for rgbd (½ ulp). Inf and NaN in the data are kept. Raises `UnsupportedError` for a
@@ -245,10 +246,13 @@ def _encode_small(values: npt.NDArray[Any]) -> tuple[Codes, int]:
 
 def _decode_small(raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     word = np.ascontiguousarray(raw).view("<u4")[:, 0]
-    return np.stack([
-        _small_table(mantissa)[(word >> np.uint32(shift)) & np.uint32((32 << mantissa) - 1)]
-        for mantissa, shift in zip(_MANTISSAS, _SHIFTS, strict=True)
-    ], axis=1)
+    return np.stack(
+        [
+            _small_table(mantissa)[(word >> np.uint32(shift)) & np.uint32((32 << mantissa) - 1)]
+            for mantissa, shift in zip(_MANTISSAS, _SHIFTS, strict=True)
+        ],
+        axis=1,
+    )
 
 
 @cache
@@ -256,8 +260,9 @@ def _small_table(mantissa: int) -> npt.NDArray[np.float32]:
     """Return the value of every code, float32 (2^(5+mantissa),)."""
     code = np.arange(32 << mantissa)
     exponent, fraction = code >> mantissa, code & ((1 << mantissa) - 1)
-    value = np.where(exponent > 0, np.ldexp(1 + fraction / (1 << mantissa), exponent - 15),
-                     np.ldexp(fraction / (1 << mantissa), -14))
+    value = np.where(
+        exponent > 0, np.ldexp(1 + fraction / (1 << mantissa), exponent - 15), np.ldexp(fraction / (1 << mantissa), -14)
+    )
     value = np.where(exponent < 31, value, np.where(fraction > 0, np.nan, np.inf))
     return value.astype(np.float32)
 

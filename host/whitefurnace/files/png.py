@@ -41,10 +41,15 @@ def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False, effort: int = 9)
     fails.
     """
     pixels = np.ascontiguousarray(pixels)
-    if pixels.dtype not in (np.uint8, np.uint16) or pixels.ndim != 3 or pixels.shape[2] not in (1, 3, 4) or \
-            0 in pixels.shape:
-        raise ValueError(f"pixels of {pixels.dtype} and shape {pixels.shape} are not uint8 or uint16 (height, width, "
-                         "1 | 3 | 4)")
+    if (
+        pixels.dtype not in (np.uint8, np.uint16)
+        or pixels.ndim != 3
+        or pixels.shape[2] not in (1, 3, 4)
+        or 0 in pixels.shape
+    ):
+        raise ValueError(
+            f"pixels of {pixels.dtype} and shape {pixels.shape} are not uint8 or uint16 (height, width, 1 | 3 | 4)"
+        )
     import OpenImageIO as oiio
 
     height, width, channels = pixels.shape
@@ -86,8 +91,9 @@ def decode_png(data: Buffer | Source, *, side: int | None = None) -> Pixels:
     return pixels
 
 
-def write_png(path: str | os.PathLike[str], image: npt.ArrayLike, *, effort: int = 9,
-              into: Transaction | None = None) -> None:
+def write_png(
+    path: str | os.PathLike[str], image: npt.ArrayLike, *, effort: int = 9, into: Transaction | None = None
+) -> None:
     """Write a picture (height, width, 3 | 4) in sRGB as PNG.
 
     image: uint8, or sRGB floats from 0 to 1, which are clamped and rounded to the nearest of 255 steps. effort:
@@ -186,8 +192,10 @@ def _size(source: Source, body: memoryview, side: int | None) -> tuple[int, int,
     if side is not None and (width, height) != (side, side):
         raise source.wrong(f"it has {width} x {height} pixels, {side} x {side} were expected")
     if depth != 8 or colour not in (_RGB, _RGBA) or interlace or method or filters:
-        raise source.wrong(f"it is a PNG of {depth} bits, colour type {colour}{', interlaced' if interlace else ''}; "
-                           f"8 bits of RGB (2) or RGBA (6), not interlaced, are read")
+        raise source.wrong(
+            f"it is a PNG of {depth} bits, colour type {colour}{', interlaced' if interlace else ''}; "
+            f"8 bits of RGB (2) or RGBA (6), not interlaced, are read"
+        )
     return width, height, 4 if colour == _RGBA else 3
 
 
@@ -204,8 +212,10 @@ def _inflated(source: Source, data: bytes, wanted: int) -> bytearray:
     except zlib.error as error:
         raise source.wrong(f"its pixels cannot be inflated ({error})") from error
     if len(out) != wanted or not inflate.eof:
-        raise source.wrong(f"its pixels inflate to {'more than ' if len(out) > wanted else ''}{min(len(out), wanted)} "
-                           f"bytes, its header needs {wanted}{'' if inflate.eof else ' and an end'}")
+        raise source.wrong(
+            f"its pixels inflate to {'more than ' if len(out) > wanted else ''}{min(len(out), wanted)} "
+            f"bytes, its header needs {wanted}{'' if inflate.eof else ' and an end'}"
+        )
     return out
 
 

@@ -83,18 +83,31 @@ def _opened(path: Path) -> Iterator[tuple[Any, ImageFacts]]:
         source = oiio.ImageInput.open(str(path))
         complaint = image._complaint(oiio)
         if source is None:
-            raise InputError(f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG"
-                             if "could not find a format reader" in complaint or not complaint else
-                             f"{path} is not a valid image: {image._reason(complaint, path)}")
+            raise InputError(
+                f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG"
+                if "could not find a format reader" in complaint or not complaint
+                else f"{path} is not a valid image: {image._reason(complaint, path)}"
+            )
         try:
             spec, form = source.spec(), source.format_name()
             if form in image._NOT_IMAGES:
                 raise InputError(f"{path} is a file of kind {form}, an image was expected")
             image._check_size(spec, path, size, form)
-            own: dict[str, Any] = {a.name.removeprefix(PREFIX): a.value for a in spec.extra_attribs
-                                   if a.name.startswith(PREFIX)}
-            yield source, ImageFacts(form, spec.full_width, spec.full_height, tuple(spec.channelnames),
-                                     str(spec.format), spec.get_string_attribute("compression"), own)
+            own: dict[str, Any] = {
+                a.name.removeprefix(PREFIX): a.value for a in spec.extra_attribs if a.name.startswith(PREFIX)
+            }
+            yield (
+                source,
+                ImageFacts(
+                    form,
+                    spec.full_width,
+                    spec.full_height,
+                    tuple(spec.channelnames),
+                    str(spec.format),
+                    spec.get_string_attribute("compression"),
+                    own,
+                ),
+            )
         finally:
             source.close()
             image._complaint(source)

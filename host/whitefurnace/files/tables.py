@@ -58,8 +58,10 @@ def stored_format(suffix: str, channels: int, given: str | None) -> str | None:
     most = {name: 4 if suffix == ".png" else FORMATS[name].channels for name in known}
     fitting = [name for name in known if most[name] >= channels and given in (None, name)]
     if not fitting:
-        raise UnsupportedError(f"{given or suffix} holds {max(most[name] for name in known if given in (None, name))} "
-                               f"channels at most, and the table has {channels}")
+        raise UnsupportedError(
+            f"{given or suffix} holds {max(most[name] for name in known if given in (None, name))} "
+            f"channels at most, and the table has {channels}"
+        )
     return fitting[0]
 
 
@@ -72,13 +74,22 @@ def check_table(suffix: str, shape: Sequence[int], channels: int) -> None:
         if len(shape) > 2 or max(shape) > MAX_SIDE:
             raise UsageError(f"PNG holds two axes of at most {MAX_SIDE}, not {' × '.join(map(str, shape))}: give .npy")
     elif len(shape) > 3 or (len(shape) == 3 and shape[0] > MAX_LAYERS):
-        raise UsageError(f"{suffix} holds three axes, the slowest of at most {MAX_LAYERS}, not "
-                         f"{' × '.join(map(str, shape))}: give .npy")
+        raise UsageError(
+            f"{suffix} holds three axes, the slowest of at most {MAX_LAYERS}, not "
+            f"{' × '.join(map(str, shape))}: give .npy"
+        )
 
 
-def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str | None, *, slack: float = 0.0,
-                texts: Mapping[str, str] | None = None, comment: Sequence[str] = (),
-                into: Transaction | None = None) -> Stored:
+def write_table(
+    path: str | os.PathLike[str],
+    cells: npt.NDArray[Any],
+    form: str | None,
+    *,
+    slack: float = 0.0,
+    texts: Mapping[str, str] | None = None,
+    comment: Sequence[str] = (),
+    into: Transaction | None = None,
+) -> Stored:
     """Write the floats `cells` […, y, x, c] as .png, .ktx2, .dds or .h, by the suffix of `path`.
 
     A third axis becomes the layers of a 2-D array. Channels that the table does not have are 0, the fourth is 1.
@@ -89,8 +100,9 @@ def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str
     path, suffix = Path(path), Path(path).suffix.lower()
     low, high = float(cells.min()), float(cells.max())
     if not (math.isfinite(low) and math.isfinite(high)):
-        raise UnsupportedError(f"{path}: the table has values that are not finite, which {suffix} does not hold: give "
-                               ".npy or .exr")
+        raise UnsupportedError(
+            f"{path}: the table has values that are not finite, which {suffix} does not hold: give .npy or .exr"
+        )
     if suffix == ".h":
         write_pieces(path, (line.encode() for line in _header(path.stem, cells, comment)), into)
         return Stored(cells.dtype.name, 0.0)  # enough digits to read back the same floats
@@ -99,8 +111,10 @@ def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str
         most = 65535 if form == "r16" else 255
         room = max(slack, 0.5 / most)
         if low < -room or high > 1 + room:
-            raise UnsupportedError(f"{path}: values from {low:.4g} to {high:.4g} do not fit in [0, 1], which is what "
-                                   "PNG holds: give .exr, .npy or .ktx2")
+            raise UnsupportedError(
+                f"{path}: values from {low:.4g} to {high:.4g} do not fit in [0, 1], which is what "
+                "PNG holds: give .exr, .npy or .ktx2"
+            )
         held = np.rint(np.clip(cells.astype(np.float64), 0, 1) * most)
         codes = held.astype(np.uint16 if most > 255 else np.uint8)
         # No texture loader reads grey with alpha as two values, so two channels are stored as red and green.
@@ -108,12 +122,14 @@ def write_table(path: str | os.PathLike[str], cells: npt.NDArray[Any], form: str
         return Stored(form, float(np.abs(held / most - cells).max()))
     largest = FORMATS[form].largest
     if max(-low, high) > largest:
-        raise UnsupportedError(f"{path}: values from {low:.4g} to {high:.4g} do not fit in {form}, which ends at "
-                               f"{largest:g}: give --format rgba32f")
+        raise UnsupportedError(
+            f"{path}: values from {low:.4g} to {high:.4g} do not fit in {form}, which ends at "
+            f"{largest:g}: give --format rgba32f"
+        )
     keys = {name: text_value(text) for name, text in (texts or {}).items()} if suffix == ".ktx2" else {}
     texture = encode(form, [_widened(np.ascontiguousarray(cells), FORMATS[form].channels, 1)], key_values=keys).texture
     write_texture(path, texture, zstd=ZSTD if suffix == ".ktx2" else None, into=into)
-    back = decode(texture, 0)[..., :cells.shape[-1]].astype(np.float64)
+    back = decode(texture, 0)[..., : cells.shape[-1]].astype(np.float64)
     return Stored(form, float(np.abs(back - cells).max()))
 
 
@@ -128,9 +144,11 @@ def _widened(cells: npt.NDArray[Any], channels: int, one: int) -> npt.NDArray[An
     return np.concatenate([cells, more], axis=-1)
 
 
-KEYWORDS = frozenset("auto break case char const continue default do double else enum extern float for goto if inline "
-                     "int long register restrict return short signed sizeof static struct switch typedef union "
-                     "unsigned void volatile while".split())
+KEYWORDS = frozenset(
+    "auto break case char const continue default do double else enum extern float for goto if inline "
+    "int long register restrict return short signed sizeof static struct switch typedef union "
+    "unsigned void volatile while".split()
+)
 """Keywords of C, which cannot name an array: a file may be called default.h."""
 
 
@@ -155,11 +173,11 @@ def _header(stem: str, cells: npt.NDArray[Any], comment: Sequence[str]) -> Itera
     shape = cells.shape[:-1] if cells.shape[-1] == 1 else cells.shape
     yield f"static const {'float' if kind == 'float32' else 'double'} {name}{''.join(f'[{n}]' for n in shape)} = {{\n"
     rows = cells.reshape(-1, *cells.shape[-2:])
-    outer = shape[:cells.ndim - 3]
+    outer = shape[: cells.ndim - 3]
     for k, row in enumerate(rows):
         # The braces of an outer axis open at its first row and close at its last.
-        opened = sum(1 for d in range(len(outer)) if k % math.prod([*outer[d + 1:], cells.shape[-3]]) == 0)
-        closed = sum(1 for d in range(len(outer)) if (k + 1) % math.prod([*outer[d + 1:], cells.shape[-3]]) == 0)
+        opened = sum(1 for d in range(len(outer)) if k % math.prod([*outer[d + 1 :], cells.shape[-3]]) == 0)
+        closed = sum(1 for d in range(len(outer)) if (k + 1) % math.prod([*outer[d + 1 :], cells.shape[-3]]) == 0)
         texels = [", ".join(number(x, kind) for x in texel) for texel in row.tolist()]
         joined = ", ".join(texels if cells.shape[-1] == 1 else (f"{{{t}}}" for t in texels))
         yield f"{'{' * opened}{{{joined}}}{'}' * closed},\n"

@@ -2,6 +2,7 @@
 
 Computes the error of every level by the project's definition, and the errors of spherical harmonics and of tables.
 """
+
 from __future__ import annotations
 
 import itertools
@@ -117,8 +118,11 @@ def compare(a: Contents, b: Contents, *, axes_a: str | None = None, axes_b: str 
         notices.append(f"{a.path.name if a.holds == 'sheen' else b.path.name} holds Charlie's lobe, the other does not")
     for found in (a, b):
         if not found.levels and found.sh is None and found.irradiance is None:
-            raise UnsupportedError(f"{found.path}: {found.notices[0]}" if found.notices else
-                                   f"{found.path} holds no levels and no table to compare")
+            raise UnsupportedError(
+                f"{found.path}: {found.notices[0]}"
+                if found.notices
+                else f"{found.path} holds no levels and no table to compare"
+            )
     rows: list[Row] = []
     if _is_sphere(a) and _is_sphere(b) and a.levels and b.levels:
         rows += _levels(a, b, notices)
@@ -140,8 +144,9 @@ def _is_sphere(found: Contents) -> bool:
 def _levels(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
     layers = {found.levels[0].texels.shape[0] if found.kind == "cube array" else 0 for found in (a, b)}
     if len(layers) > 1:
-        raise UnsupportedError(f"{a.path} is a {a.kind} and {b.path} a {b.kind}: arrays are compared with arrays of as "
-                               "many layers")
+        raise UnsupportedError(
+            f"{a.path} is a {a.kind} and {b.path} a {b.kind}: arrays are compared with arrays of as many layers"
+        )
     shown: list[tuple[Level, Level]] = []
     for one, other in _matched(a, b, notices):
         if a.kind != "cube array":
@@ -168,22 +173,32 @@ def _matched(a: Contents, b: Contents, notices: list[str]) -> list[tuple[Level, 
             found.append((pick[0], other))
             free.remove(pick[0])
         elif known:
-            notices.append(f"{other.name} of {b.path.name} (r = {other.roughness:.4g}) has the size of "
-                           f"{known[0].name} of {a.path.name}, whose r is {known[0].roughness:.4g}: not compared")
+            notices.append(
+                f"{other.name} of {b.path.name} (r = {other.roughness:.4g}) has the size of "
+                f"{known[0].name} of {a.path.name}, whose r is {known[0].roughness:.4g}: not compared"
+            )
     if found:
         for side, whole in enumerate((a, b)):
             alone = [level for level in whole.levels if not any(pair[side] is level for pair in found)]
             if alone:
-                notices.append(", ".join(f"{level.name} ({_size(level)})" for level in alone) +
-                               f" of {whole.path.name}: no counterpart")
+                notices.append(
+                    ", ".join(f"{level.name} ({_size(level)})" for level in alone)
+                    + f" of {whole.path.name}: no counterpart"
+                )
         return sorted(found, key=lambda pair: b.levels.index(pair[1]))
     # No size is common: compare a pair of the same known roughness, else the first levels.
-    by_roughness = [(one, other) for one in a.levels for other in b.levels
-                    if one.roughness is not None and other.roughness is not None and _same(one, other)]
+    by_roughness = [
+        (one, other)
+        for one in a.levels
+        for other in b.levels
+        if one.roughness is not None and other.roughness is not None and _same(one, other)
+    ]
     one, other = by_roughness[0] if by_roughness else (a.levels[0], b.levels[0])
     if not by_roughness and one.roughness is not None and other.roughness is not None:
-        raise UnsupportedError(f"{a.path} and {b.path} have no level of one roughness: "
-                               f"r = {one.roughness:.4g} and r = {other.roughness:.4g}")
+        raise UnsupportedError(
+            f"{a.path} and {b.path} have no level of one roughness: "
+            f"r = {one.roughness:.4g} and r = {other.roughness:.4g}"
+        )
     return [(one, other)]
 
 
@@ -220,26 +235,51 @@ def _sphere(part: str, one: Level, other: Level, notices: list[str]) -> Row:
     unlike = wrong & ~((a == b) | (np.isnan(a) & np.isnan(b))).all(1)
     if wrong.any():
         a, b = np.where(wrong[:, None], 0.0, a), np.where(wrong[:, None], 0.0, b)
-        notices.append(f"{part}: {int(wrong.sum())} texels are not finite in A or B, {int(unlike.sum())} of them "
-                       "differ")
+        notices.append(
+            f"{part}: {int(wrong.sum())} texels are not finite in A or B, {int(unlike.sum())} of them differ"
+        )
     mean = float((weights[:, None] * b).sum()) / (3 * float(weights.sum()))
     errors = texel_errors(a, b, mean)
     errors[unlike] = math.inf
     energy = float((weights[:, None] * b * b).sum())
     difference = float((weights[:, None] * (a - b) ** 2).sum())
-    rmse = math.inf if unlike.any() else math.sqrt(difference / energy) if energy > 0 else 0.0 if difference == 0 else \
+    rmse = (
         math.inf
+        if unlike.any()
+        else math.sqrt(difference / energy)
+        if energy > 0
+        else 0.0
+        if difference == 0
+        else math.inf
+    )
     at = int(errors.argmax())
-    direction = (shape.directions(np.array([at])) if dims[-1] == 2 * shape.size or not latlong else
-                 latlong_centres(dims[0], dims[1], np.array([at])))[:, 0]
+    direction = (
+        shape.directions(np.array([at]))
+        if dims[-1] == 2 * shape.size or not latlong
+        else latlong_centres(dims[0], dims[1], np.array([at]))
+    )[:, 0]
     *face, row, column = np.unravel_index(at, dims)
-    place = (f"face {FACES[face[0]]}, " if face else "") + f"texel ({column}, {row}), towards " + \
-        "({:.2f}, {:.2f}, {:.2f})".format(*(direction + 0.0))
+    place = (
+        (f"face {FACES[face[0]]}, " if face else "")
+        + f"texel ({column}, {row}), towards "
+        + "({:.2f}, {:.2f}, {:.2f})".format(*(direction + 0.0))
+    )
     roughness = other.roughness if other.roughness is not None else one.roughness
     size = f"{shape.size}²" if not latlong else f"{dims[1]}×{dims[0]}"
     place = place if errors[at] > 0 else ""
-    return Row(part, "level", size, method, percentile(errors), float(errors.max()), rmse, place, roughness,
-               one.stated.get("error"), errors.reshape(dims))
+    return Row(
+        part,
+        "level",
+        size,
+        method,
+        percentile(errors),
+        float(errors.max()),
+        rmse,
+        place,
+        roughness,
+        one.stated.get("error"),
+        errors.reshape(dims),
+    )
 
 
 def _named(level: Level) -> str:
@@ -267,20 +307,35 @@ def _laid(a: np.ndarray, b: np.ndarray, means: bool) -> tuple[np.ndarray, np.nda
     """
     angles = [math.pi / 2 / x.shape[1] if x.ndim == 4 else math.pi / x.shape[0] for x in (a, b)]
     order = [(a, b), (b, a)] if angles[1] >= angles[0] else [(b, a), (a, b)]
-    for fine, coarse in order[:2 if max(angles) <= ALIKE * min(angles) else 1]:
+    for fine, coarse in order[: 2 if max(angles) <= ALIKE * min(angles) else 1]:
         if means and _affordable(fine, coarse):
             latlong = coarse.ndim == 3
             shape = Shape(latlong, coarse.shape[-3])
-            over = mean_over_texels(np.ascontiguousarray(fine, np.float32), 0.0, latlong, shape.size,
-                                    np.arange(shape.count)).reshape(*coarse.shape)
+            over = mean_over_texels(
+                np.ascontiguousarray(fine, np.float32), 0.0, latlong, shape.size, np.arange(shape.count)
+            ).reshape(*coarse.shape)
             first, second, names = (over, b, "AB") if fine is a else (a, over, "BA")
-            return first, second, "overlap", (f"the means of {names[0]} over the texels of {names[1]} are compared, "
-                                              f"which is exact where {names[1]} was made of {names[0]}")
-    d = (cube_centres(b.shape[1], np.arange(b.size // 3)) if b.ndim == 4 else
-         latlong_centres(b.shape[0], b.shape[1], np.arange(b.size // 3)))
+            return (
+                first,
+                second,
+                "overlap",
+                (
+                    f"the means of {names[0]} over the texels of {names[1]} are compared, "
+                    f"which is exact where {names[1]} was made of {names[0]}"
+                ),
+            )
+    d = (
+        cube_centres(b.shape[1], np.arange(b.size // 3))
+        if b.ndim == 4
+        else latlong_centres(b.shape[0], b.shape[1], np.arange(b.size // 3))
+    )
     read = bilinear(a, d) if a.ndim == 4 else _read_latlong(a, d)
-    return read.reshape(b.shape), b, "bilinear", ("A is read bilinearly at B's texel centres, and what that is off by "
-                                                  "is in the errors")
+    return (
+        read.reshape(b.shape),
+        b,
+        "bilinear",
+        ("A is read bilinearly at B's texel centres, and what that is off by is in the errors"),
+    )
 
 
 def _affordable(fine: np.ndarray, coarse: np.ndarray) -> bool:
@@ -303,14 +358,16 @@ def _read_latlong(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
         row = np.where(row < 0, -1 - row, np.where(row >= rows, 2 * rows - 1 - row, row))
         return texels[row, np.where(over, column + columns // 2, column) % columns].astype(np.float64)
 
-    return ((1 - v) * ((1 - u) * at(i, j) + u * at(i, j + 1))
-            + v * ((1 - u) * at(i + 1, j) + u * at(i + 1, j + 1)))
+    return (1 - v) * ((1 - u) * at(i, j) + u * at(i, j + 1)) + v * ((1 - u) * at(i + 1, j) + u * at(i + 1, j + 1))
 
 
 def _symmetry(pairs: Sequence[tuple[Level, Level]]) -> list[str]:
     """Return a notice where A's cube agrees far better after a turn or a reflection; else an empty list."""
-    alike = [(one, other) for one, other in pairs if one.texels.ndim == 4 and one.texels.shape == other.texels.shape
-             and one.size > 1]
+    alike = [
+        (one, other)
+        for one, other in pairs
+        if one.texels.ndim == 4 and one.texels.shape == other.texels.shape and one.size > 1
+    ]
     if not alike:
         return []
     one, other = min(alike, key=lambda pair: abs(pair[0].size - 32))
@@ -322,17 +379,23 @@ def _symmetry(pairs: Sequence[tuple[Level, Level]]) -> list[str]:
     now = off(a)
     if now <= 1e-4 * float((b * b).sum()):  # with an RMSE below 1 % the cube is not turned
         return []
-    least, best = min((off(turned_cube(a, axes.T)), text)
-                      for text, axes in _symmetries())
+    least, best = min((off(turned_cube(a, axes.T)), text) for text, axes in _symmetries())
     if least > MIRRORED**2 * now:
         # Not a symmetry of the cube: try to turn or mirror each face by itself.
         flips = {"left to right": a[:, :, ::-1], "upside down": a[:, ::-1], "by half a turn": a[:, ::-1, ::-1]}
         least, best = min((off(texels), name) for name, texels in flips.items())
-        return [] if least > MIRRORED**2 * now else [
-            f"each face of A is turned or mirrored by itself: {best} the RMS difference of {other.name} is "
-            f"{math.sqrt(least / now):.1g} of what it is now"]
-    return [f"A is turned or mirrored: with --axes-a {best!r} the RMS difference of {other.name} is "
-            f"{math.sqrt(least / now):.1g} of what it is now"]
+        return (
+            []
+            if least > MIRRORED**2 * now
+            else [
+                f"each face of A is turned or mirrored by itself: {best} the RMS difference of {other.name} is "
+                f"{math.sqrt(least / now):.1g} of what it is now"
+            ]
+        )
+    return [
+        f"A is turned or mirrored: with --axes-a {best!r} the RMS difference of {other.name} is "
+        f"{math.sqrt(least / now):.1g} of what it is now"
+    ]
 
 
 def _reduced(texels: np.ndarray) -> np.ndarray:
@@ -386,8 +449,10 @@ def _along(texels: np.ndarray, axes: np.ndarray, found: Contents) -> np.ndarray:
         return np.stack(cubes).reshape(texels.shape)
     rows, columns, _ = texels.shape
     if abs(axes[1, 1]) != 1 or columns % 4:
-        raise UnsupportedError(f"{found.path} is a lat-long: axes that move y, or a width that is no multiple of 4, "
-                               "would have its texels resampled")
+        raise UnsupportedError(
+            f"{found.path} is a lat-long: axes that move y, or a width that is no multiple of 4, "
+            "would have its texels resampled"
+        )
     d = axes @ latlong_centres(rows, columns, rows // 2 * columns + np.arange(columns))
     column = np.rint((np.arctan2(d[2], d[0]) / (2 * math.pi) + 0.5) * columns - 0.5).astype(int) % columns
     return (texels[::-1] if axes[1, 1] < 0 else texels)[:, column]
@@ -400,13 +465,17 @@ def _tables(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
     if _is_sphere(a) != _is_sphere(b) and "table" not in (a.kind, b.kind):
         raise UnsupportedError(f"{a.path} holds {a.kind} and {b.path} {b.kind}, which cannot be compared")
     named = {level.name: level for level in a.levels}
-    pairs = ([(named[level.name], level) for level in b.levels if level.name in named] if a.kind == b.kind == "arrays"
-             else list(zip(a.levels, b.levels, strict=False)))
+    pairs = (
+        [(named[level.name], level) for level in b.levels if level.name in named]
+        if a.kind == b.kind == "arrays"
+        else list(zip(a.levels, b.levels, strict=False))
+    )
     alike = [(one, other) for one, other in pairs if one.texels.shape[:-1] == other.texels.shape[:-1]]
     if not alike:
         shapes = (" × ".join(map(str, found.levels[0].texels.shape[:-1])) for found in (a, b))
-        raise UnsupportedError(f"{a.path} and {b.path} are tables of {' and '.join(shapes)} texels, tables of one size "
-                               "are compared")
+        raise UnsupportedError(
+            f"{a.path} and {b.path} are tables of {' and '.join(shapes)} texels, tables of one size are compared"
+        )
     for one, other in alike:
         yield from _table(other.name, one, other, notices)
 
@@ -414,8 +483,10 @@ def _tables(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
 def _table(part: str, one: Level, other: Level, notices: list[str]) -> Iterator[Row]:
     a, b = one.texels, other.texels
     if a.shape[-1] != b.shape[-1]:
-        notices.append(f"{part}: A has {a.shape[-1]} channels, B {b.shape[-1]}; the first "
-                       f"{min(a.shape[-1], b.shape[-1])} are compared")
+        notices.append(
+            f"{part}: A has {a.shape[-1]} channels, B {b.shape[-1]}; the first "
+            f"{min(a.shape[-1], b.shape[-1])} are compared"
+        )
     for channel in range(min(a.shape[-1], b.shape[-1])):
         x, y = (texels[..., channel].astype(np.float64) for texels in (a, b))
         with np.errstate(invalid="ignore"):
@@ -424,15 +495,27 @@ def _table(part: str, one: Level, other: Level, notices: list[str]) -> Iterator[
         cell = np.unravel_index(int(errors.argmax()), errors.shape)
         place = f"cell ({', '.join(str(int(k)) for k in reversed(cell))})" if errors.max() > 0 else ""
         size = "×".join(str(n) for n in reversed(errors.shape))
-        yield Row(f"{part}, channel {channel + 1}", "table", size, "cell by cell", percentile(errors),
-                  float(errors.max()), None, place, None, one.stated.get("error"), errors)
+        yield Row(
+            f"{part}, channel {channel + 1}",
+            "table",
+            size,
+            "cell by cell",
+            percentile(errors),
+            float(errors.max()),
+            None,
+            place,
+            None,
+            one.stated.get("error"),
+            errors,
+        )
 
 
 def _others(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
     """Compare the irradiance, the spherical harmonics and the DFG table, where both files have them."""
     if a.irradiance is not None and b.irradiance is not None:
-        yield _sphere("irradiance", replace(a.irradiance, roughness=None), replace(b.irradiance, roughness=None),
-                      notices)
+        yield _sphere(
+            "irradiance", replace(a.irradiance, roughness=None), replace(b.irradiance, roughness=None), notices
+        )
     if a.sh is not None and b.sh is not None:
         off = np.abs(a.sh - b.sh)
         scale = float(np.abs(b.sh[0]).max())
@@ -440,7 +523,15 @@ def _others(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
         k, c = np.unravel_index(int(np.nan_to_num(errors, nan=math.inf).argmax()), errors.shape)
         worst = float(np.nan_to_num(errors, nan=math.inf).max())
         names = ("L00", "L1-1", "L10", "L11", "L2-2", "L2-1", "L20", "L21", "L22")
-        yield Row("SH", "sh", "9×3", "over the largest L00", worst, worst, None,
-                  f"{names[int(k)]} of {'RGB'[int(c)]}" if worst > 0 else "")
+        yield Row(
+            "SH",
+            "sh",
+            "9×3",
+            "over the largest L00",
+            worst,
+            worst,
+            None,
+            f"{names[int(k)]} of {'RGB'[int(c)]}" if worst > 0 else "",
+        )
     if a.dfg is not None and b.dfg is not None and a.dfg.texels.shape[:-1] == b.dfg.texels.shape[:-1]:
         yield from _table("dfg", a.dfg, b.dfg, notices)

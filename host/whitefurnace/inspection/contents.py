@@ -2,6 +2,7 @@
 
 For files that this tool wrote, the statements of their manifests are read too.
 """
+
 from __future__ import annotations
 
 import json
@@ -35,8 +36,7 @@ from whitefurnace.files import (
 from whitefurnace.sphere.environments import cube_solid_angles, faces_of, latlong_solid_angles
 from whitefurnace.sphere.harmonics import SCALINGS, unscaled
 
-KINDS = ("cube", "cube array", "lat-long", "image", "image array", "table", "arrays", "harmonics", "code",
-         "manifest")
+KINDS = ("cube", "cube array", "lat-long", "image", "image array", "table", "arrays", "harmonics", "code", "manifest")
 FIGURES = ("error", "worst", "rmse", "format_p99", "format_worst")
 """Errors that a manifest states for a level: those of the filter, and those that the pixel format adds."""
 
@@ -192,8 +192,16 @@ def _of_manifest(path: Path) -> Contents:
         files = {path.name.removesuffix(".json"): found}
     whole = bool(files) and all(_matches(path.parent / name, entry) for name, entry in files.items())
     facts: dict[str, str | int] = {"lists": ", ".join(sorted(files)) or "no files", "bytes": size}
-    return Contents(path, "manifest", "JSON", "a manifest of whitefurnace", (), sh=_manifest_sh(found), facts=facts,
-                    statement=Statement(path, whole, _without_files(found)))
+    return Contents(
+        path,
+        "manifest",
+        "JSON",
+        "a manifest of whitefurnace",
+        (),
+        sh=_manifest_sh(found),
+        facts=facts,
+        statement=Statement(path, whole, _without_files(found)),
+    )
 
 
 def _is_harmonics(path: Path) -> bool:
@@ -213,9 +221,17 @@ def _of_harmonics(path: Path, statement: Statement | None) -> Contents:
     if scale is None and b"pre-scaled base" in path.read_bytes():
         scale = "filament"
     notices = () if scale else ("nothing says the scale of the coefficients; they are taken as the radiance's",)
-    return Contents(path, "harmonics", "text", f"9 × 3 coefficients, scale {scale or 'radiance'}", (),
-                    sh=unscaled(values, scale or "radiance"), facts={"bytes": path.stat().st_size},
-                    statement=statement, notices=notices)
+    return Contents(
+        path,
+        "harmonics",
+        "text",
+        f"9 × 3 coefficients, scale {scale or 'radiance'}",
+        (),
+        sh=unscaled(values, scale or "radiance"),
+        facts={"bytes": path.stat().st_size},
+        statement=statement,
+        notices=notices,
+    )
 
 
 def _of_header(path: Path, statement: Statement | None) -> Contents:
@@ -235,25 +251,36 @@ def _of_arrays(path: Path, statement: Statement | None) -> Contents:
         table = _is_table(statement)
         form = f"{array.dtype.name}, array of {' × '.join(map(str, array.shape)) or '1'}"
         kind = "table" if table else _kind_of(array.shape)
-        level = Level("the table" if kind == "table" else "level 0", _floats(path, array, kind), stored=array.nbytes,
-                      stated=_stated_figures(statement, "error"))
+        level = Level(
+            "the table" if kind == "table" else "level 0",
+            _floats(path, array, kind),
+            stored=array.nbytes,
+            stated=_stated_figures(statement, "error"),
+        )
         return Contents(path, kind, "npy", form, (level,), facts={"bytes": size}, statement=statement)
     names = list(arrays)
     form = " and ".join(sorted({array.dtype.name for array in arrays.values()}))
     facts: dict[str, str | int] = {"arrays": ", ".join(names), "bytes": size}
     if "specular_0" not in arrays:
-        plain = tuple(Level(name, _floats(path, array, "arrays"), stored=array.nbytes)
-                      for name, array in arrays.items() if array.ndim >= 2)
+        plain = tuple(
+            Level(name, _floats(path, array, "arrays"), stored=array.nbytes)
+            for name, array in arrays.items()
+            if array.ndim >= 2
+        )
         return Contents(path, "arrays", "npz", form, plain, facts=facts, statement=statement)
     levels: list[Level] = []
     while f"specular_{len(levels)}" in arrays:
         k = len(levels)
         array = arrays[f"specular_{k}"]
         if array.ndim != 4 or array.shape[0] != 6 or array.shape[1] != array.shape[2] or not array.size:
-            raise InputError(f"{path} is not valid: its specular_{k} is an array of {array.shape}, (6, n, n, 3) was "
-                             "expected")
-        own = {str(name): float(arrays[name].ravel()[k]) for name in ("error", "worst", "rmse", "roughness")
-               if name in arrays and arrays[name].size > k}
+            raise InputError(
+                f"{path} is not valid: its specular_{k} is an array of {array.shape}, (6, n, n, 3) was expected"
+            )
+        own = {
+            str(name): float(arrays[name].ravel()[k])
+            for name in ("error", "worst", "rmse", "roughness")
+            if name in arrays and arrays[name].size > k
+        }
         levels.append(Level(f"level {k}", _floats(path, array, "cube"), own.pop("roughness", None), array.nbytes, own))
 
     def part(name: str, ndim: int) -> Level | None:
@@ -263,14 +290,28 @@ def _of_arrays(path: Path, statement: Statement | None) -> Contents:
         square = ndim == 3 or (array.ndim == 4 and array.shape[0] == 6 and array.shape[1] == array.shape[2])
         if array.ndim != ndim or not square or not array.size:
             raise InputError(f"{path} is not valid: its {name} is an array of {array.shape}")
-        return Level(name, _floats(path, array, name), stored=array.nbytes,
-                     stated=_stated_figures(statement, "error", "worst", "rmse", within=name))
+        return Level(
+            name,
+            _floats(path, array, name),
+            stored=array.nbytes,
+            stated=_stated_figures(statement, "error", "worst", "rmse", within=name),
+        )
 
     sh = arrays.get("sh")
     if sh is not None and sh.shape != (9, 3):
         raise InputError(f"{path} is not valid: its sh is an array of {sh.shape}, (9, 3) was expected")
-    return Contents(path, "cube", "npz", form, tuple(levels), part("irradiance", 4),
-                    None if sh is None else sh.astype(np.float64), part("dfg", 3), facts=facts, statement=statement)
+    return Contents(
+        path,
+        "cube",
+        "npz",
+        form,
+        tuple(levels),
+        part("irradiance", 4),
+        None if sh is None else sh.astype(np.float64),
+        part("dfg", 3),
+        facts=facts,
+        statement=statement,
+    )
 
 
 def _of_light(path: Path, statement: Statement | None) -> Contents:
@@ -280,8 +321,21 @@ def _of_light(path: Path, statement: Statement | None) -> Contents:
         statement = Statement(None, None, {name: _value(text) for name, text in own.items()})
     if light.undecoded:
         kind = ("cube" if light.cube else "image") + (" array" if light.layers else "")
-        return Contents(path, kind, light.container, light.format, (), None, _light_sh(light), None, light.keys,
-                        light.facts, light.largest, statement, (light.undecoded,))
+        return Contents(
+            path,
+            kind,
+            light.container,
+            light.format,
+            (),
+            None,
+            _light_sh(light),
+            None,
+            light.keys,
+            light.facts,
+            light.largest,
+            statement,
+            (light.undecoded,),
+        )
     kind, placed, notices = _light_kind(light, statement)
     roughness = _roughness_of(light, statement, placed)
     stated = _stated_levels(statement)
@@ -291,13 +345,29 @@ def _of_light(path: Path, statement: Statement | None) -> Contents:
     if kind == "table":
         stated = {0: _stated_figures(statement, "error", "format_worst")}
     levels = tuple(
-        Level("the table" if kind == "table" and k == 0 else f"level {k}", texels, r, stored,
-              _figures(stated.get(k, {})))
-        for k, (texels, r, stored) in enumerate(zip(placed, roughness, light.stored or [None] * len(placed),
-                                                    strict=False)))
+        Level(
+            "the table" if kind == "table" and k == 0 else f"level {k}", texels, r, stored, _figures(stated.get(k, {}))
+        )
+        for k, (texels, r, stored) in enumerate(
+            zip(placed, roughness, light.stored or [None] * len(placed), strict=False)
+        )
+    )
     irradiance = None if light.irradiance is None else Level("irradiance", light.irradiance)
-    return Contents(path, kind, light.container, light.format, levels, irradiance, _light_sh(light), None, light.keys,
-                    light.facts, light.largest, statement, notices)
+    return Contents(
+        path,
+        kind,
+        light.container,
+        light.format,
+        levels,
+        irradiance,
+        _light_sh(light),
+        None,
+        light.keys,
+        light.facts,
+        light.largest,
+        statement,
+        notices,
+    )
 
 
 def _light_kind(light: Light, statement: Statement | None) -> tuple[str, Sequence[np.ndarray], tuple[str, ...]]:
@@ -337,8 +407,9 @@ def _of_image(path: Path, statement: Statement | None) -> Contents:
         stated = _figures(attributes) or _stated_figures(statement, "error", "format_worst")
         level = Level("the table", _table_of(path, facts.format, statement), stated=stated)
         limit = () if statement is not None and statement.stated.get("format") == "rgbd" else limit
-        return Contents(path, "table", container, form, (level,), keys=keys, facts=shown, largest=limit,
-                        statement=statement)
+        return Contents(
+            path, "table", container, form, (level,), keys=keys, facts=shown, largest=limit, statement=statement
+        )
     image = read_image(path)
     atlas = statement is not None and statement.stated.get("layout") == "octahedral"
     found = None if atlas else faces_of(image.pixels)
@@ -349,8 +420,20 @@ def _of_image(path: Path, statement: Statement | None) -> Contents:
     row = {**_stated_levels(statement).get(0, {}), **attributes}
     level = Level("level 0", texels, _stated_number(row.get("roughness")), None, _figures(row))
     sh = attributes.get("sh")
-    return Contents(path, kind, container, form, (level,), None, _sh_text(sh) if isinstance(sh, str) else None,
-                    keys=keys, facts=shown, largest=limit, statement=statement, notices=image.notices)
+    return Contents(
+        path,
+        kind,
+        container,
+        form,
+        (level,),
+        None,
+        _sh_text(sh) if isinstance(sh, str) else None,
+        keys=keys,
+        facts=shown,
+        largest=limit,
+        statement=statement,
+        notices=image.notices,
+    )
 
 
 def _is_table(statement: Statement | None) -> bool:
@@ -530,8 +613,11 @@ def _roughness_of(light: Light, statement: Statement | None, levels: Sequence[np
             if len(numbers) == len(levels) and all(math.isfinite(r) for r in numbers):
                 return list(numbers)
     rows = _stated_levels(statement)
-    if light.cube and len(rows) == len(levels) and all(row.get("size") == texels.shape[-3] for row, texels in
-                                                       zip(rows.values(), levels, strict=True)):
+    if (
+        light.cube
+        and len(rows) == len(levels)
+        and all(row.get("size") == texels.shape[-3] for row, texels in zip(rows.values(), levels, strict=True))
+    ):
         return [_stated_number(row.get("roughness")) for row in rows.values()]
     return [None] * len(levels)
 
@@ -594,13 +680,21 @@ def statistics(found: Contents, level: Level) -> Statistics:
         weight = float((total * finite[..., k]).sum())
         means.append(float((clean[..., k] * total).sum(dtype=np.float64)) / weight if weight else math.nan)
     at = 0
-    for k, largest in enumerate(found.largest[:texels.shape[-1]]):
+    for k, largest in enumerate(found.largest[: texels.shape[-1]]):
         at += int(np.count_nonzero(clean[..., k] >= np.float32(largest)))
     some = texels[finite]
     low, high = (float(some.min()), float(some.max())) if some.size else (math.nan, math.nan)
     nan = int(np.count_nonzero(np.isnan(texels)))
-    return Statistics(low, high, tuple(means), nan, int(finite.size - np.count_nonzero(finite)) - nan,
-                      int(np.count_nonzero(texels < 0)), at, alpha)
+    return Statistics(
+        low,
+        high,
+        tuple(means),
+        nan,
+        int(finite.size - np.count_nonzero(finite)) - nan,
+        int(np.count_nonzero(texels < 0)),
+        at,
+        alpha,
+    )
 
 
 def _weights(found: Contents, level: Level) -> np.ndarray:
@@ -616,15 +710,23 @@ def described(found: Contents) -> dict[str, Any]:
     """Return all facts about the contents as plain data, for a row of JSON, with `statistics` and `looks_like`."""
     parts = [*found.levels, *(part for part in (found.irradiance, found.dfg) if part is not None)]
     return {
-        "event": "contents", "file": str(found.path), "kind": found.kind, "container": found.container,
-        "format": found.format, **({"header": dict(found.facts)}),
+        "event": "contents",
+        "file": str(found.path),
+        "kind": found.kind,
+        "container": found.container,
+        "format": found.format,
+        **({"header": dict(found.facts)}),
         "levels": [_row(found, level) for level in parts],
         **({} if found.sh is None else {"sh": found.sh.tolist()}),
-        "keys": dict(found.keys), "looks_like": looks_like(found),
-        "statement": None if found.statement is None else {
+        "keys": dict(found.keys),
+        "looks_like": looks_like(found),
+        "statement": None
+        if found.statement is None
+        else {
             **found.statement.stated,
             "manifest": None if found.statement.manifest is None else str(found.statement.manifest),
-            "whole": found.statement.whole},
+            "whole": found.statement.whole,
+        },
         "notices": list(found.notices),
     }
 
@@ -634,10 +736,22 @@ def _row(found: Contents, level: Level) -> dict[str, Any]:
     shape = level.texels.shape
     faces = len(shape) >= 4 and (found.cube or level is found.irradiance)
     size = f"{level.size}²" if faces else "×".join(str(n) for n in shape[-2:-4:-1])
-    return {"name": level.name, "shape": list(shape), "size": size, "bytes": level.stored, "roughness": level.roughness,
-            "low": said.low, "high": said.high, "mean": list(said.mean), "nan": said.nan, "infinite": said.infinite,
-            "negative": said.negative, "at_limit": said.at_limit,
-            "alpha": None if said.alpha is None else list(said.alpha), **level.stated}
+    return {
+        "name": level.name,
+        "shape": list(shape),
+        "size": size,
+        "bytes": level.stored,
+        "roughness": level.roughness,
+        "low": said.low,
+        "high": said.high,
+        "mean": list(said.mean),
+        "nan": said.nan,
+        "infinite": said.infinite,
+        "negative": said.negative,
+        "at_limit": said.at_limit,
+        "alpha": None if said.alpha is None else list(said.alpha),
+        **level.stated,
+    }
 
 
 # ------------------------------------------------------------------------------------------------- engines
@@ -647,8 +761,12 @@ def looks_like(found: Contents) -> list[str]:
     """List the engines whose files look like this one, judged by its bytes alone, as `ENGINE: use of the file`."""
     if not found.levels:
         return []
-    said = [f"{engine.name}: {HOLDS[file.holds]}" for engine in ENGINES.values() for file in engine.file
-            if _fits(found, engine, file)]
+    said = [
+        f"{engine.name}: {HOLDS[file.holds]}"
+        for engine in ENGINES.values()
+        for file in engine.file
+        if _fits(found, engine, file)
+    ]
     if found.container == "npz" and found.cube:
         said.append(f"raw: {ENGINES['raw'].title}")
     return said

@@ -1,4 +1,5 @@
 """Draws maps of the errors of one file against another, as PNG."""
+
 from __future__ import annotations
 
 import math
@@ -37,12 +38,14 @@ def draw_comparison(folder: Path, found: Comparison) -> Path:
     """
     # All maps of one kind have the same colour scale: five decades down from the largest error.
     shown = [row for row in found.rows if row.errors is not None]
-    largest = {kind: max((row.worst for row in shown if row.kind == kind and math.isfinite(row.worst)), default=1.0)
-               for kind in ("level", "table")}
+    largest = {
+        kind: max((row.worst for row in shown if row.kind == kind and math.isfinite(row.worst)), default=1.0)
+        for kind in ("level", "table")
+    }
     path = folder / "compare.png"
     with drawing(path) as figure:
         panels = [Panel(partial(_error_map, figure, row, largest[row.kind] or 1.0), 4.6, after=0.5) for row in shown]
-        lay_out(figure, [(3.45, panels[k:k + 2]) for k in range(0, len(panels), 2)])
+        lay_out(figure, [(3.45, panels[k : k + 2]) for k in range(0, len(panels), 2)])
         heading(figure, "Errors of A against B", f"{found.a.path.name}  against  {found.b.path.name}", "0.35")
     return path
 
@@ -53,7 +56,7 @@ def _error_map(figure: Figure, row: Compared, largest: float, axes: Axes) -> Non
         n = errors.shape[1]
         flat = np.full((3 * n, 4 * n), np.nan)
         for face, (down, across) in zip(errors, CROSS, strict=True):
-            flat[down * n:(down + 1) * n, across * n:(across + 1) * n] = face
+            flat[down * n : (down + 1) * n, across * n : (across + 1) * n] = face
     else:
         flat = errors.reshape(-1, errors.shape[-1])
     colours = colours_named("cividis")
@@ -64,9 +67,16 @@ def _error_map(figure: Figure, row: Compared, largest: float, axes: Axes) -> Non
     for side in axes.spines.values():
         side.set_visible(False)
     flat = np.clip(flat, 1e-300, 1e300)  # keeps the logarithm finite for 0 and for infinite errors
-    image = axes.imshow(np.ma.masked_invalid(flat), cmap=colours, norm=logarithmic_scale(1e-5 * largest, largest),
-                        interpolation="nearest")
+    image = axes.imshow(
+        np.ma.masked_invalid(flat),
+        cmap=colours,
+        norm=logarithmic_scale(1e-5 * largest, largest),
+        interpolation="nearest",
+    )
     roughness = "" if row.roughness is None else f", r = {row.roughness:.3g}"
-    axes.set_title(f"{row.part}, {row.size}{roughness}: {small_label(row.error)}, worst {small_label(row.worst)}"
-                   if math.isfinite(row.worst) else f"{row.part}, {row.size}{roughness}: red is not finite")
+    axes.set_title(
+        f"{row.part}, {row.size}{roughness}: {small_label(row.error)}, worst {small_label(row.worst)}"
+        if math.isfinite(row.worst)
+        else f"{row.part}, {row.size}{roughness}: red is not finite"
+    )
     colour_bar(figure, axes, image, extend="both")

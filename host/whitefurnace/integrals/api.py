@@ -2,6 +2,7 @@
 
 Reflected radiance reads images, so its module is imported when it is first asked for.
 """
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -20,12 +21,28 @@ if TYPE_CHECKING:
     from whitefurnace.sphere.environments import Environment
 
 
-def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
-              diffuse: Spec | None = None, brdf: Spec | None = None, light: Spec | None = None,
-              environment: str | np.ndarray | Environment | None = None, normal: Sequence[float] | None = None,
-              rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse", precision: int = 32,
-              tolerance: float | None = None, backfacing: str | None = None, device: Device | str | None = None,
-              out: np.ndarray | None = None, progress: Progress | None = None, **parameters: Any) -> Integrated:
+def integrate(
+    name: str,
+    *,
+    ndf: Spec | None = None,
+    masking: Spec = "smith",
+    fresnel: Spec = "one",
+    diffuse: Spec | None = None,
+    brdf: Spec | None = None,
+    light: Spec | None = None,
+    environment: str | np.ndarray | Environment | None = None,
+    normal: Sequence[float] | None = None,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: str = "refuse",
+    precision: int = 32,
+    tolerance: float | None = None,
+    backfacing: str | None = None,
+    device: Device | str | None = None,
+    out: np.ndarray | None = None,
+    progress: Progress | None = None,
+    **parameters: Any,
+) -> Integrated:
     """Integrate a BRDF over all broadcast `parameters` and return the values with their error.
 
     name: the integral: normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance.
@@ -60,9 +77,19 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fr
     Raises UsageError for unknown names and values outside their domain, UnsupportedError for a combination that no rule
     serves, DeviceError where no device works, and what `environment` raises.
     """
-    models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf,
-                              "precision": precision, "tolerance": tolerance, "backfacing": backfacing,
-                              "device": device, "out": out, "progress": progress}
+    models: dict[str, Any] = {
+        "ndf": ndf,
+        "masking": masking,
+        "fresnel": fresnel,
+        "diffuse": diffuse,
+        "brdf": brdf,
+        "precision": precision,
+        "tolerance": tolerance,
+        "backfacing": backfacing,
+        "device": device,
+        "out": out,
+        "progress": progress,
+    }
     if name != "radiance":
         lit = {"light": light, "environment": environment, "normal": normal}
         wrong = [key for key, value in lit.items() if value is not None]
@@ -71,8 +98,16 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fr
         return run.integrate(name, **models, **parameters)
     from whitefurnace.integrals.radiance import radiance
 
-    return radiance(light=light, environment=environment, normal=normal, rotate=rotate, exposure=exposure,
-                    nonfinite=nonfinite, **models, **parameters)
+    return radiance(
+        light=light,
+        environment=environment,
+        normal=normal,
+        rotate=rotate,
+        exposure=exposure,
+        nonfinite=nonfinite,
+        **models,
+        **parameters,
+    )
 
 
 __all__ = ["integrate"]

@@ -1,4 +1,5 @@
 """Draws microfacet normals from any NDF: by its own quantile where it has one, else by a table of its energy."""
+
 from __future__ import annotations
 
 import math
@@ -18,8 +19,15 @@ QUANTILES = 4096
 e-folds of angle that is wrong by h²/12 ≈ 1e-6 of the density."""
 
 
-def sample(ndf: str | Model, count: int, *, seed: int = 0, device: Device | str | None = None, precision: int = 32,
-           **parameters: float) -> np.ndarray:
+def sample(
+    ndf: str | Model,
+    count: int,
+    *,
+    seed: int = 0,
+    device: Device | str | None = None,
+    precision: int = 32,
+    **parameters: float,
+) -> np.ndarray:
     """Draw `count` normals m with density D(m)(n·m): (count, 3) float64, n = +z.
 
     ndf: a name (`ggx`, `ggx:alpha=.3`), a catalogue entry or the path of a `.clh` file.
@@ -35,8 +43,11 @@ def sample(ndf: str | Model, count: int, *, seed: int = 0, device: Device | str 
     entry = choice.model
     if not 1 <= count <= 1 << 28:
         raise UsageError(f"count {count} is outside [1, {1 << 28}]")
-    given: dict[str, Any] = {**{p.name: p.default for p in entry.parameters if p.default is not None}, **choice.given,
-                             **{name.removeprefix("ndf_"): value for name, value in parameters.items()}}
+    given: dict[str, Any] = {
+        **{p.name: p.default for p in entry.parameters if p.default is not None},
+        **choice.given,
+        **{name.removeprefix("ndf_"): value for name, value in parameters.items()},
+    }
     known = [p.name for p in entry.parameters]
     for name in given:
         if name not in known:
@@ -55,8 +66,9 @@ def sample(ndf: str | Model, count: int, *, seed: int = 0, device: Device | str 
     phi = 2 * math.pi * v
     if not entry.isotropic:
         r = np.sqrt(_closed(on, entry, u, numbers, precision))
-        stretch = [float(evaluate(on, f"NDF_STRETCH_{axis}", {"ndf": entry}, numbers, precision)[0, 0])
-                   for axis in "XY"]
+        stretch = [
+            float(evaluate(on, f"NDF_STRETCH_{axis}", {"ndf": entry}, numbers, precision)[0, 0]) for axis in "XY"
+        ]
         m = np.stack([stretch[0] * r * np.cos(phi), stretch[1] * r * np.sin(phi), np.ones(count)], 1)
         return m / np.linalg.norm(m, axis=1, keepdims=True)
     sin2 = quantiles(on, entry, numbers, u, precision)
@@ -84,14 +96,16 @@ def _closed(device: Device, entry: Model, u: np.ndarray, numbers: np.ndarray, pr
 def _energy(device: Device, entry: Model, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The energy below each of QUANTILES + 1 angles, from 0 to 1, and the angles."""
     precision = finest(device)
-    width, reach = (float(evaluate(device, f, {"ndf": entry}, numbers, precision)[0, 0])
-                    for f in ("NDF_WIDTH", "NDF_REACH"))
+    width, reach = (
+        float(evaluate(device, f, {"ndf": entry}, numbers, precision)[0, 0]) for f in ("NDF_WIDTH", "NDF_REACH")
+    )
     edges = np.linspace(0, math.asinh(reach / width), QUANTILES + 1)
     x, w = np.polynomial.legendre.leggauss(4)
     t = (edges[:-1, None] + edges[1:, None]) / 2 + np.diff(edges)[:, None] / 2 * x
     theta = np.minimum(width * np.sinh(t), math.pi / 2)
-    cells = np.concatenate([np.stack([np.cos(theta), np.sin(theta) ** 2]).reshape(2, -1),
-                            np.repeat(numbers, theta.size, 1)])
+    cells = np.concatenate(
+        [np.stack([np.cos(theta), np.sin(theta) ** 2]).reshape(2, -1), np.repeat(numbers, theta.size, 1)]
+    )
     D = evaluate(device, "NDF_D", {"ndf": entry}, cells, precision)[0].astype(np.float64).reshape(theta.shape)
     if entry.text is not None:
         refuse_bad(entry, D.ravel(), theta.ravel())

@@ -3,6 +3,7 @@
 A piece is P(t) = C + A cos t + B sin t above the horizon. Panels are graded where an integral along them has its short
 scales. Float64; `radiance_outline.cl` sums them.
 """
+
 from __future__ import annotations
 
 import math
@@ -42,13 +43,15 @@ class Pieces:
 
 
 def _joined(pieces: list[Pieces]) -> Pieces:
-    return Pieces(*(np.concatenate([getattr(p, name) for p in pieces])
-                    for name in ("C", "A", "B", "start", "end", "cell")))
+    return Pieces(
+        *(np.concatenate([getattr(p, name) for p in pieces]) for name in ("C", "A", "B", "start", "end", "cell"))
+    )
 
 
 def _kept(pieces: Pieces, keep: np.ndarray) -> Pieces:
-    return Pieces(pieces.C[keep], pieces.A[keep], pieces.B[keep], pieces.start[keep], pieces.end[keep],
-                  pieces.cell[keep])
+    return Pieces(
+        pieces.C[keep], pieces.A[keep], pieces.B[keep], pieces.start[keep], pieces.end[keep], pieces.cell[keep]
+    )
 
 
 def _unit(a: np.ndarray) -> np.ndarray:
@@ -88,8 +91,9 @@ def _rectangle(center: np.ndarray, u: np.ndarray, v: np.ndarray) -> Pieces:
         setting = np.where((up_a & ~up_b)[:, None], cut, setting)
         rising = np.where((~up_a & up_b)[:, None], cut, rising)
         sets |= up_a & ~up_b
-        pieces.append(_arcs(np.where(up_a[:, None], a, cut), np.where(up_b[:, None], b, cut), cell,
-                            facing & (up_a | up_b)))
+        pieces.append(
+            _arcs(np.where(up_a[:, None], a, cut), np.where(up_b[:, None], b, cut), cell, facing & (up_a | up_b))
+        )
     pieces.append(_arcs(setting, rising, cell, facing & sets))
     return _joined(pieces)
 
@@ -123,6 +127,7 @@ def outline(light: str, numbers: Mapping[str, np.ndarray]) -> Pieces:
 
     light: "disc" or "rectangle". There are none where the light shines away or is below the horizon.
     """
+
     def vector(name: str) -> np.ndarray:
         return np.stack([numbers[f"{name}_{axis}"] for axis in "xyz"], -1)
 
@@ -187,8 +192,9 @@ def _crossing(pieces: Pieces, direction: np.ndarray, level: np.ndarray | float =
     return np.where(np.isfinite(t), t, pieces.start)
 
 
-def panels(pieces: Pieces, NoV: np.ndarray, phi: np.ndarray,
-           widths: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def panels(
+    pieces: Pieces, NoV: np.ndarray, phi: np.ndarray, widths: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (11, m) of panels, as `source.OUTLINE` names them, and the cell of each, sorted.
 
     NoV, phi: the views of the cells, (n,). widths: (n, 2) of the lobe along x and y; None for a diffuse model, whose

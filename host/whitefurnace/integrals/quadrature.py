@@ -1,4 +1,5 @@
 """Computes an integral of the catalogue over a grid of parameters, with an estimate of its error."""
+
 from __future__ import annotations
 
 import time
@@ -44,11 +45,22 @@ nodes, as kinks leave it, falls by 1.4 a rule, and 1/1.4 + 1/1.4² + … is 2.5.
 Progress = Callable[[float], None]
 
 
-def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
-              fresnel: Spec = "one", diffuse: Spec | None = None, brdf: Spec | None = None,
-              precision: int = 32, tolerance: float | None = None, backfacing: str | None = None,
-              device: Device | str | None = None, out: np.ndarray | None = None, progress: Progress | None = None,
-              **parameters: Any) -> Integrated:
+def integrate(
+    name: str,
+    *,
+    ndf: Spec | None = None,
+    masking: Spec = "smith",
+    fresnel: Spec = "one",
+    diffuse: Spec | None = None,
+    brdf: Spec | None = None,
+    precision: int = 32,
+    tolerance: float | None = None,
+    backfacing: str | None = None,
+    device: Device | str | None = None,
+    out: np.ndarray | None = None,
+    progress: Progress | None = None,
+    **parameters: Any,
+) -> Integrated:
     """Integrate a BRDF over all broadcast `parameters`; `whitefurnace.integrate` documents the arguments.
 
     name: any integral but radiance. Raises what `whitefurnace.integrate` raises.
@@ -75,15 +87,24 @@ def integrate(name: str, *, ndf: Spec | None = None, masking: Spec = "smith",
     totals = Totals()
     for begin in range(0, grid.size, CELLS_A_LAUNCH):
         end = min(begin + CELLS_A_LAUNCH, grid.size)
-        total = sum(_average(part, grid, begin, end, tolerance, totals) if entry.name == "albedo_average" else
-                    _at_grazing(part, grid.rows(part, begin, end), tolerance, totals) for part in parts)
+        total = sum(
+            _average(part, grid, begin, end, tolerance, totals)
+            if entry.name == "albedo_average"
+            else _at_grazing(part, grid.rows(part, begin, end), tolerance, totals)
+            for part in parts
+        )
         flat[begin:end] = np.asarray(total).T
         if progress:
             progress(end / grid.size)
     error = totals.error * len(parts)
-    return Integrated(values, error, totals.evaluations, time.perf_counter() - start,
-                      totals.rule.name if totals.rule else "",
-                      (*totals.notices(), *missed(error, tolerance, precision), *_of_files(parts, flat)))
+    return Integrated(
+        values,
+        error,
+        totals.evaluations,
+        time.perf_counter() - start,
+        totals.rule.name if totals.rule else "",
+        (*totals.notices(), *missed(error, tolerance, precision), *_of_files(parts, flat)),
+    )
 
 
 def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
@@ -100,7 +121,8 @@ def _of_files(parts: Sequence[Part], flat: np.ndarray) -> Iterator[str]:
             if entry.text is not None and entry.slot == "ndf":
                 some = f"{low:.4g}" if high - low <= 1e-4 * high else f"{low:.4g} to {high:.4g}"
                 yield f"{entry.path}: ∫ D(m)(n·m) dω = {some}" + (
-                    "" if part.entry.name == "normalization" else ", divided out")
+                    "" if part.entry.name == "normalization" else ", divided out"
+                )
             elif entry.text is not None:
                 yield f"{entry.path}: albedo from {flat.min():.4g} to {flat.max():.4g}"
 
@@ -119,9 +141,17 @@ class TableSpec:
     digests: tuple[str, ...]
 
 
-def table_spec(name: str, *, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
-               diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
-               **parameters: Any) -> TableSpec:
+def table_spec(
+    name: str,
+    *,
+    ndf: Spec | None = None,
+    masking: Spec = "smith",
+    fresnel: Spec = "one",
+    diffuse: Spec | None = None,
+    brdf: Spec | None = None,
+    backfacing: str | None = None,
+    **parameters: Any,
+) -> TableSpec:
     """Check the arguments of `integrate` without a device, and return what it would compute.
 
     Raises what `integrate` raises for its arguments.
@@ -155,16 +185,18 @@ def _refuse_lit(entry: Integral) -> None:
         raise UsageError("integral radiance needs a light or an environment: whitefurnace.integrate takes them")
 
 
-def slots_of(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
-           diffuse: Spec | None, brdf: Spec | None) -> dict[str, Chosen]:
+def slots_of(
+    entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec, diffuse: Spec | None, brdf: Spec | None
+) -> dict[str, Chosen]:
     """Return the models of the slots that an integral needs. A slot that it does not need is not compiled in.
 
     Raises UsageError and UnsupportedError for models that do not go together or that the integral has no use for.
     """
     albedo = entry.name in ("albedo", "albedo_average", "radiance")
     if not albedo and (diffuse is not None or brdf is not None):
-        raise UnsupportedError(f"integral {entry.name} is of an NDF; a diffuse model or a BRDF has albedo, "
-                               "albedo_average and radiance")
+        raise UnsupportedError(
+            f"integral {entry.name} is of an NDF; a diffuse model or a BRDF has albedo, albedo_average and radiance"
+        )
     if brdf is not None:
         if ndf is not None or diffuse is not None:
             raise UsageError("a brdf is whole: give it without an ndf and a diffuse model")
@@ -178,8 +210,10 @@ def slots_of(entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec,
         missing = [f for f in entry.needs if f not in provided and f.split("_")[0].lower() in slots]
         if missing:
             owners = [(slots[f.split("_")[0].lower()].model, f.split("_", 1)[1]) for f in missing]
-            raise UnsupportedError(f"integral {entry.name}: " + ", ".join(
-                f"{owner.slot} {owner.name} has no {what}" for owner, what in owners))
+            raise UnsupportedError(
+                f"integral {entry.name}: "
+                + ", ".join(f"{owner.slot} {owner.name} has no {what}" for owner, what in owners)
+            )
     elif diffuse is None:
         raise UsageError(f"integral {entry.name} needs an ndf{', a diffuse model or a brdf' if albedo else ''}")
     if diffuse is not None:
@@ -206,8 +240,11 @@ class Grid:
     def part(self, name: str, begin: int, end: int) -> np.ndarray:
         """Return cells [begin, end) of a column, float64."""
         column = self.columns[name]
-        return np.full(end - begin, float(column)) if column.ndim == 0 else np.asarray(
-            np.broadcast_to(column, self.shape).flat[begin:end], np.float64)
+        return (
+            np.full(end - begin, float(column))
+            if column.ndim == 0
+            else np.asarray(np.broadcast_to(column, self.shape).flat[begin:end], np.float64)
+        )
 
     def rows(self, part: Part, begin: int, end: int) -> np.ndarray:
         """Return the parameter rows of one part of the BRDF for cells [begin, end), view first: (rows, end - begin)."""
@@ -223,8 +260,9 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
     """
     columns: dict[str, Any] = {}
     rgb: set[str] = set()
-    isotropic = (all(choice.model.isotropic for choice in slots.values()) and "brdf" not in slots
-                 and entry.name != "radiance")
+    isotropic = (
+        all(choice.model.isotropic for choice in slots.values()) and "brdf" not in slots and entry.name != "radiance"
+    )
     columns["NoV"] = np.ones(())
     columns["phi"] = np.zeros(())
     if entry.view:
@@ -261,8 +299,10 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
     try:
         shape = np.broadcast_shapes(*(np.shape(v) for v in columns.values()))
     except ValueError:
-        raise UsageError("parameters do not broadcast: shapes "
-                         + ", ".join(f"{k} {np.shape(v)}" for k, v in columns.items() if np.ndim(v))) from None
+        raise UsageError(
+            "parameters do not broadcast: shapes "
+            + ", ".join(f"{k} {np.shape(v)}" for k, v in columns.items() if np.ndim(v))
+        ) from None
     if 0 in shape:
         raise UsageError("parameters hold no cell: an array is empty")
     return Grid(shape, columns, bool(rgb))
@@ -290,8 +330,10 @@ def _view(given: Any, backfacing: str | None) -> np.ndarray:
     bad = ~((NoV >= 0) & (NoV <= 1))
     if bad.any():
         behind = (NoV < 0).any() and backfacing is None
-        raise UsageError(f"NoV = {NoV[bad].flat[0]:g} is outside [0, 1] (cosine of the view angle)"
-                         + ("; views from behind want backfacing = clamp or absolute" if behind else ""))
+        raise UsageError(
+            f"NoV = {NoV[bad].flat[0]:g} is outside [0, 1] (cosine of the view angle)"
+            + ("; views from behind want backfacing = clamp or absolute" if behind else "")
+        )
     return NoV
 
 
@@ -349,7 +391,7 @@ class Part:
         count = len(self.view)
         read, out, ndf = count, [rows[:count]], None
         for entry in self.slots.values():
-            numbers = numbers_of(self.device, entry, rows[read:read + len(entry.parameters)])
+            numbers = numbers_of(self.device, entry, rows[read : read + len(entry.parameters)])
             if entry.slot == "ndf" and entry.text is not None:
                 at = entry.arguments.index("per_norm")
                 self.norms = (min(self.norms[0], 1 / numbers[at].max()), max(self.norms[1], 1 / numbers[at].min()))
@@ -379,8 +421,7 @@ class Part:
 
     def text(self, terms: int) -> str:
         """Return the kernel text, with a table of Smith's area of `terms` terms."""
-        return (source.closed(self.closed, self.slots) if self.closed else
-                _program(self.entry, self.slots, terms)).text
+        return (source.closed(self.closed, self.slots) if self.closed else _program(self.entry, self.slots, terms)).text
 
     def sum(self, cells: np.ndarray, terms: int, rule: Rule, precision: int) -> np.ndarray:
         """Return the sums of one rule over cells: (components, n) in the working precision."""
@@ -405,8 +446,11 @@ def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
 def summands_of(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
     """Return the models of each summand of the BRDF: the specular one, the diffuse one or a user's whole one."""
     specular = {slot: c.model for slot, c in slots.items() if slot in ("ndf", "masking", "fresnel")}
-    return [some for some in (specular, *({slot: slots[slot].model} for slot in ("diffuse", "brdf") if slot in slots))
-            if some]
+    return [
+        some
+        for some in (specular, *({slot: slots[slot].model} for slot in ("diffuse", "brdf") if slot in slots))
+        if some
+    ]
 
 
 def parts_of(device: Device, entry: Integral, slots: Mapping[str, Chosen], precision: int) -> list[Part]:
@@ -435,8 +479,11 @@ class Totals:
 
     def notices(self) -> tuple[str, ...]:
         """Return the sentence about promoted cells, where there are any."""
-        return (f"{self.promoted} cells were done in float64: float32 did not reach the tolerance there",) \
-            if self.promoted else ()
+        return (
+            (f"{self.promoted} cells were done in float64: float32 did not reach the tolerance there",)
+            if self.promoted
+            else ()
+        )
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
@@ -458,7 +505,7 @@ def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precis
     change = np.empty(0)
     slow = max(m.checks.slow_rules or 1.0 for m in part.slots.values())
     before = np.where(np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) < BLOCK, np.inf, 0.0)
-    for rule in ladder[first + 1:]:
+    for rule in ladder[first + 1 :]:
         fine = part.sum(cells[:, active], terms, rule, precision).astype(np.float64)
         totals.used(rule, part.lanes(cells[:, active]))
         starts = np.arange(0, active.size, BLOCK)
@@ -471,7 +518,7 @@ def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precis
         open_ = ~(change <= allowed)
         done = float(np.max((change + rounding + floor * size)[~open_], initial=0.0))
         totals.error = max(totals.error, done)
-        keep = np.repeat(open_, BLOCK)[:active.size]
+        keep = np.repeat(open_, BLOCK)[: active.size]
         change, before, rounding = change[open_], before[open_], (rounding + floor * size)[open_]
         active = active[keep]
         if active.size == 0:
@@ -483,8 +530,10 @@ def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precis
     elif active.size:
         left = float(np.max(max(UNFINISHED / slow, 1) * change + rounding))
         if not np.isfinite(left):
-            raise CheckError(f"integral {part.entry.name} is not finite for some of these parameters in "
-                             f"float{precision}{_example(part, rows, values)}")
+            raise CheckError(
+                f"integral {part.entry.name} is not finite for some of these parameters in "
+                f"float{precision}{_example(part, rows, values)}"
+            )
         totals.error = max(totals.error, left)
     return values
 
@@ -544,7 +593,7 @@ def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, tot
             if change + inner.error <= max(tolerance, 2 * inner.error):
                 break
         totals.error = max(totals.error, change + inner.error)
-        out[:, some[0] - begin:some[1] - begin] = value
+        out[:, some[0] - begin : some[1] - begin] = value
     return out
 
 
@@ -553,8 +602,15 @@ def _slices(begin: int, end: int, step: int) -> Iterator[tuple[int, int]]:
         yield k, min(k + step, end)
 
 
-def dfg(size: int = 128, *, ndf: Spec = "ggx", masking: Spec = "smith",
-        tolerance: float = 5e-6, precision: int = 32, device: Device | str | None = None) -> Integrated:
+def dfg(
+    size: int = 128,
+    *,
+    ndf: Spec = "ggx",
+    masking: Spec = "smith",
+    tolerance: float = 5e-6,
+    precision: int = 32,
+    device: Device | str | None = None,
+) -> Integrated:
     """Compute the split-sum table of a specular BRDF: `values` (size, size, 2) as [y, x, (scale, bias)].
 
     size: texels an edge, 1 to 4096. x is n·v = (x + ½)/size, and y is perceptual roughness r = (y + ½)/size, α = r²,
@@ -569,8 +625,16 @@ def dfg(size: int = 128, *, ndf: Spec = "ggx", masking: Spec = "smith",
     axis = (np.arange(size) + 0.5) / size
     choice = chosen("ndf", ndf)
     rows: dict[str, Any] = rows_of_roughness(choice, axis[:, None])
-    return integrate("dfg", ndf=choice, masking=masking, tolerance=tolerance, precision=precision,
-                     device=device, NoV=np.broadcast_to(axis, (size, size)), **rows)
+    return integrate(
+        "dfg",
+        ndf=choice,
+        masking=masking,
+        tolerance=tolerance,
+        precision=precision,
+        device=device,
+        NoV=np.broadcast_to(axis, (size, size)),
+        **rows,
+    )
 
 
 def rows_of_roughness(choice: Chosen, r: np.ndarray) -> dict[str, np.ndarray]:
@@ -585,8 +649,11 @@ def rows_of_roughness(choice: Chosen, r: np.ndarray) -> dict[str, np.ndarray]:
     sets = [entry.from_roughness(float(x)) for x in r.ravel()]
     # A table's first row may fall below a domain by half a texel of roughness.
     ends = {p.name: (p.low, p.high) for p in entry.parameters}
-    return {f"{entry.slot}_{name}": np.clip(np.array([s[name] for s in sets]).reshape(r.shape), *ends[name])
-            for name in sets[0] if name not in choice.given}
+    return {
+        f"{entry.slot}_{name}": np.clip(np.array([s[name] for s in sets]).reshape(r.shape), *ends[name])
+        for name in sets[0]
+        if name not in choice.given
+    }
 
 
 __all__ = ["Integrated", "dfg", "integrate", "model"]

@@ -2,6 +2,7 @@
 
 [Hoffman2012, "The Reflectance Equation"]
 """
+
 from __future__ import annotations
 
 import math
@@ -44,9 +45,20 @@ from whitefurnace.sphere.grids import composite, cube_directions, cube_tables, l
 CELLS_A_TIME = 4096
 """Cells of an area light whose panels, some twenty each, are held together."""
 
-LADDER = tuple(Rule("outline", *step) for step in (
-    (10, 6, 5), (14, 8, 7), (20, 12, 9), (28, 16, 13), (36, 20, 17), (48, 28, 24), (64, 40, 32), (88, 56, 44),
-    (120, 80, 64)))
+LADDER = tuple(
+    Rule("outline", *step)
+    for step in (
+        (10, 6, 5),
+        (14, 8, 7),
+        (20, 12, 9),
+        (28, 16, 13),
+        (36, 20, 17),
+        (48, 28, 24),
+        (64, 40, 32),
+        (88, 56, 44),
+        (120, 80, 64),
+    )
+)
 """Nodes of the inner path from n and from its end, and along a panel of the outline (`radiance_outline.cl`)."""
 
 SHARP = {32: 1e-7, 64: 2e-16}
@@ -79,12 +91,27 @@ Surroundings = str | os.PathLike[str] | np.ndarray | Environment
 """What `environment` reads."""
 
 
-def radiance(*, light: Spec | None = None, environment: Surroundings | None = None,
-             normal: Sequence[float] | None = None, rotate: float = 0.0, exposure: float = 0.0,
-             nonfinite: str = "refuse", ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
-             diffuse: Spec | None = None, brdf: Spec | None = None, precision: int = 32,
-             tolerance: float | None = None, backfacing: str | None = None, device: Device | str | None = None,
-             out: np.ndarray | None = None, progress: Progress | None = None, **parameters: Any) -> Integrated:
+def radiance(
+    *,
+    light: Spec | None = None,
+    environment: Surroundings | None = None,
+    normal: Sequence[float] | None = None,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: str = "refuse",
+    ndf: Spec | None = None,
+    masking: Spec = "smith",
+    fresnel: Spec = "one",
+    diffuse: Spec | None = None,
+    brdf: Spec | None = None,
+    precision: int = 32,
+    tolerance: float | None = None,
+    backfacing: str | None = None,
+    device: Device | str | None = None,
+    out: np.ndarray | None = None,
+    progress: Progress | None = None,
+    **parameters: Any,
+) -> Integrated:
     """Compute reflected radiance; `whitefurnace.integrate` documents arguments, values and errors."""
     start = time.perf_counter()
     if precision not in (32, 64):
@@ -95,8 +122,12 @@ def radiance(*, light: Spec | None = None, environment: Surroundings | None = No
     tolerance = defaults[precision] if tolerance is None else tolerance
     if not is_number(tolerance) or not 0 < tolerance < 1:
         raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
-    for name, value, default in (("normal", normal, None), ("rotate", rotate, 0.0), ("exposure", exposure, 0.0),
-                                 ("nonfinite", nonfinite, "refuse")):
+    for name, value, default in (
+        ("normal", normal, None),
+        ("rotate", rotate, 0.0),
+        ("exposure", exposure, 0.0),
+        ("nonfinite", nonfinite, "refuse"),
+    ):
         if light is not None and value != default:
             raise UsageError(f"{name} is of an environment; a light is given in the frame of the surface")
     entry = integral("radiance")
@@ -115,31 +146,46 @@ def radiance(*, light: Spec | None = None, environment: Surroundings | None = No
     return task.result(_fill(task, how, 3 if "brdf" in slots else 1, out), start)
 
 
-def _chosen(light: Spec | None, ndf: Spec | None, masking: Spec, fresnel: Spec, diffuse: Spec | None,
-            brdf: Spec | None) -> dict[str, Chosen]:
+def _chosen(
+    light: Spec | None, ndf: Spec | None, masking: Spec, fresnel: Spec, diffuse: Spec | None, brdf: Spec | None
+) -> dict[str, Chosen]:
     """The slots, filled; a perfectly smooth surface has its Fresnel alone."""
     smooth = ndf is None and diffuse is None and brdf is None
-    slots = {"fresnel": chosen("fresnel", fresnel)} if smooth else \
-        slots_of(integral("radiance"), ndf, masking, fresnel, diffuse, brdf)
+    slots = (
+        {"fresnel": chosen("fresnel", fresnel)}
+        if smooth
+        else slots_of(integral("radiance"), ndf, masking, fresnel, diffuse, brdf)
+    )
     if light is not None:
         slots["light"] = chosen("light", light)
         if smooth and slots["light"].model.name == "punctual":
-            raise UnsupportedError("a perfectly smooth surface reflects no punctual light but along one direction; "
-                                   "give an ndf, a diffuse model or a brdf")
+            raise UnsupportedError(
+                "a perfectly smooth surface reflects no punctual light but along one direction; "
+                "give an ndf, a diffuse model or a brdf"
+            )
     return slots
 
 
-def radiance_spec(*, light: Spec | None, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
-                  diffuse: Spec | None = None, brdf: Spec | None = None, backfacing: str | None = None,
-                  **parameters: Any) -> TableSpec:
+def radiance_spec(
+    *,
+    light: Spec | None,
+    ndf: Spec | None = None,
+    masking: Spec = "smith",
+    fresnel: Spec = "one",
+    diffuse: Spec | None = None,
+    brdf: Spec | None = None,
+    backfacing: str | None = None,
+    **parameters: Any,
+) -> TableSpec:
     """Return what `radiance` would compute with the same arguments; without a light, for an environment."""
     entry, slots = integral("radiance"), _chosen(light, ndf, masking, fresnel, diffuse, brdf)
     shape = grid_of(entry, slots, dict(parameters), backfacing).shape
     return TableSpec(entry, slots, (*shape, 3) if light is None or "brdf" in slots else shape, (source.everything(),))
 
 
-def _fill(task: _Task, how: Callable[[_Task, int, int], np.ndarray], components: int,
-          out: np.ndarray | None) -> np.ndarray:
+def _fill(
+    task: _Task, how: Callable[[_Task, int, int], np.ndarray], components: int, out: np.ndarray | None
+) -> np.ndarray:
     """The values, made by `how` of some cells at a time as (components, n).
 
     Where the cells are RGB themselves (a preset, a colour), each takes its own of three components.
@@ -198,19 +244,26 @@ class _Task:
         rule = self.totals.rule.name if self.totals.rule else self.rule
         # What is left of float32 is the rounding of the values themselves.
         rounding = float(np.abs(values).max()) * (6e-8 if self.precision == 32 else 1e-15)
-        return Integrated(values, sum(self.errors.values()) + rounding, self.totals.evaluations + self.closed,
-                          time.perf_counter() - start, rule, self.totals.notices())
+        return Integrated(
+            values,
+            sum(self.errors.values()) + rounding,
+            self.totals.evaluations + self.closed,
+            time.perf_counter() - start,
+            rule,
+            self.totals.notices(),
+        )
 
 
 # ---------------------------------------------------------------------------------------------- closed forms
 
 
-def _at(task: _Task, function: str, slots: Mapping[str, Model], arguments: np.ndarray, begin: int,
-        end: int) -> tuple[np.ndarray, float]:
+def _at(
+    task: _Task, function: str, slots: Mapping[str, Model], arguments: np.ndarray, begin: int, end: int
+) -> tuple[np.ndarray, float]:
     """(components, n): a function of the slots at arguments (rows, n), finest precision; the error of its table."""
     part = Part(task.device, integral("albedo"), dict(slots), finest(task.device))
     numbers, terms, error = part.cells(task.grid.rows(part, begin, end), part.precision)
-    cells = np.concatenate([arguments, numbers[len(part.view):]])
+    cells = np.concatenate([arguments, numbers[len(part.view) :]])
     found = evaluate(task.device, function, slots, cells, part.precision, terms)
     task.closed += cells.shape[1]
     return found.astype(np.float64), error
@@ -295,7 +348,7 @@ def _widths(task: _Task, slots: Mapping[str, Model], begin: int, end: int) -> np
     part = Part(task.device, integral("albedo"), {"ndf": slots["ndf"]}, finest(task.device))
     numbers, _, _ = part.cells(task.grid.rows(part, begin, end), part.precision)
     names = ("NDF_WIDTH",) if slots["ndf"].isotropic else ("NDF_STRETCH_X", "NDF_STRETCH_Y")
-    distinct, which = unique_rows(numbers[len(part.view):])
+    distinct, which = unique_rows(numbers[len(part.view) :])
     found = [evaluate(task.device, f, {"ndf": slots["ndf"]}, distinct, part.precision)[0][which] for f in names]
     return np.minimum(np.stack([found[0], found[-1]], -1).astype(np.float64), 1.0)
 
@@ -360,10 +413,11 @@ class _Outlined(Part):
         total = np.zeros((self.components, cells.shape[1]))
         if not len(index):
             return total
-        numbers = cells[len(self.view):]
+        numbers = cells[len(self.view) :]
         rows = np.concatenate([cells[:2, which], self.rows[:, index], numbers[:, which]])
-        values = over_nodes(self.device, source.outline(self.slots, terms).text, "integrate", rows, self.components,
-                            precision, rule).astype(np.float64)
+        values = over_nodes(
+            self.device, source.outline(self.slots, terms).text, "integrate", rows, self.components, precision, rule
+        ).astype(np.float64)
         for c in range(self.components):
             total[c] = np.bincount(which, values[c], cells.shape[1])
             most = np.bincount(which, np.abs(values[c]), cells.shape[1]).max()
@@ -377,8 +431,9 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
     model = task.slots["light"].model
     _refuse_flat(model.name, light)
     if "area" not in task.parts:
-        task.parts["area"] = [_Outlined(task.device, task.entry, some, task.precision, light=model)
-                              for some in summands_of(task.slots)]
+        task.parts["area"] = [
+            _Outlined(task.device, task.entry, some, task.precision, light=model) for some in summands_of(task.slots)
+        ]
     total: Any = 0.0
     error = 0.0
     for part in task.parts["area"]:
@@ -422,8 +477,16 @@ def _refuse_flat(name: str, light: Mapping[str, np.ndarray]) -> None:
 # ---------------------------------------------------------------------------------------------- environments
 
 
-def _environment_of(task: _Task, given: Surroundings, normal: Sequence[float] | None, rotate: float,
-                    exposure: float, nonfinite: str, out: np.ndarray | None, start: float) -> Integrated:
+def _environment_of(
+    task: _Task,
+    given: Surroundings,
+    normal: Sequence[float] | None,
+    rotate: float,
+    exposure: float,
+    nonfinite: str,
+    out: np.ndarray | None,
+    start: float,
+) -> Integrated:
     """Values (…, 3): the least radiance of each channel by the albedo, the rest over the texels' nodes."""
     frame = frame_of((0.0, 1.0, 0.0) if normal is None else normal)
     env = environment(given, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
@@ -436,8 +499,9 @@ def _environment_of(task: _Task, given: Surroundings, normal: Sequence[float] | 
     smooth = set(task.models) == {"fresnel"}
     values = _fill(task, mirror if smooth else lambda _, begin, end: texels.integral(begin, end), 3, out)
     result = task.result(values, start)
-    return Integrated(result.values, result.error, result.evaluations, result.seconds, task.rule,
-                      (*env.notices, *result.notices))
+    return Integrated(
+        result.values, result.error, result.evaluations, result.seconds, task.rule, (*env.notices, *result.notices)
+    )
 
 
 def frame_of(normal: Sequence[float]) -> np.ndarray:
@@ -510,8 +574,12 @@ class _Texels:
         along = np.stack([[-z, z, x, x, x, -x][k] for k in range(6)])
         down = np.stack([[-y, -y, z, -z, -y, -y][k] for k in range(6)])
         reach = np.take_along_axis(size, axis[None], 0)[0]
-        column, row = (np.clip(((np.take_along_axis(a, face[None], 0)[0] / reach + 1) / 2 * self.rows).astype(int), 0,
-                               self.rows - 1) for a in (along, down))
+        column, row = (
+            np.clip(
+                ((np.take_along_axis(a, face[None], 0)[0] / reach + 1) / 2 * self.rows).astype(int), 0, self.rows - 1
+            )
+            for a in (along, down)
+        )
         return self.env.texels[face, row, column].T.astype(np.float64)
 
     # ---------------------------------------------------------------------------------- nodes
@@ -519,8 +587,11 @@ class _Texels:
     def _table(self, cuts: int, precision: int) -> tuple[Buffer, Buffer]:
         if (cuts, precision) not in self._tables:
             x, w = (np.array([0.5]), np.array([1.0])) if cuts == 1 else composite(cuts)
-            tables = (latlong_tables(self.rows, self.columns, x, w, self.env.rotation) if self.latlong
-                      else cube_tables(self.rows, x, w))
+            tables = (
+                latlong_tables(self.rows, self.columns, x, w, self.env.rotation)
+                if self.latlong
+                else cube_tables(self.rows, x, w)
+            )
             kind = np.dtype(f"f{precision // 8}")
             rows, columns = (self.task.device.array(t.astype(kind)) for t in tables)
             self._tables[cuts, precision] = rows, columns
@@ -532,8 +603,9 @@ class _Texels:
         kind = np.dtype(f"f{precision // 8}")
         real = kind.type
         rows, columns = self._table(cuts, precision)
-        kernel = device.build(source.frame_nodes(self.env.kind).text,
-                              {"W": 1, "T": 1, "PRECISION": precision}).kernel("frame_nodes")
+        kernel = device.build(source.frame_nodes(self.env.kind).text, {"W": 1, "T": 1, "PRECISION": precision}).kernel(
+            "frame_nodes"
+        )
         frame = device.array(self.frame.astype(kind))
         skipped = None if skip is None else device.array(skip.astype(np.uint8))
         width, height = self.columns * cuts, self.faces * self.rows * cuts
@@ -544,10 +616,26 @@ class _Texels:
         total = np.zeros((3, cells.shape[1]))
         for first in range(0, height, band):
             count = min(band, height - first) * width
-            device.launch(kernel, (stride,), (
-                listed, np.int32(stride), np.int32(first), np.int32(count), frame, skipped, np.int32(self.rows),
-                np.int32(self.columns), np.int32(cuts), real(math.cos(turn)), real(math.sin(turn)), rows, columns,
-                self._rest_on))
+            device.launch(
+                kernel,
+                (stride,),
+                (
+                    listed,
+                    np.int32(stride),
+                    np.int32(first),
+                    np.int32(count),
+                    frame,
+                    skipped,
+                    np.int32(self.rows),
+                    np.int32(self.columns),
+                    np.int32(cuts),
+                    real(math.cos(turn)),
+                    real(math.sin(turn)),
+                    rows,
+                    columns,
+                    self._rest_on,
+                ),
+            )
             total += self._over(listed, stride, cells, terms, precision)
         return total
 
@@ -565,17 +653,21 @@ class _Texels:
         lanes, n = device.lanes(precision), cells.shape[1]
         steps = next(s for s in range(STEPS, 0, -1) if stride % (s * lanes * device.local_size) == 0)
         items = stride // (lanes * steps)
-        kernel = device.build(source.lit_nodes(self.task.models, terms).text,
-                              {"W": lanes, "T": 1, "PRECISION": precision}).kernel("integrate")
+        kernel = device.build(
+            source.lit_nodes(self.task.models, terms).text, {"W": lanes, "T": 1, "PRECISION": precision}
+        ).kernel("integrate")
         kind = np.dtype(f"f{precision // 8}")
         total = np.empty((3, n))
         for begin in range(0, n, 256):
-            some = np.repeat(cells[:, begin:begin + 256], lanes, 1).astype(kind)
+            some = np.repeat(cells[:, begin : begin + 256], lanes, 1).astype(kind)
             views = some.shape[1] // lanes
             result = device.empty((3, views, items * lanes), kind)
-            device.launch(kernel, (items, views), (result, np.int32(some.shape[1]), np.int32(items), np.int32(steps),
-                                                   listed, device.array(some)))
-            total[:, begin:begin + views] = result.read().sum(2, dtype=np.float64)
+            device.launch(
+                kernel,
+                (items, views),
+                (result, np.int32(some.shape[1]), np.int32(items), np.int32(steps), listed, device.array(some)),
+            )
+            total[:, begin : begin + views] = result.read().sum(2, dtype=np.float64)
         return total
 
     # ---------------------------------------------------------------------------------- close texels
@@ -586,8 +678,9 @@ class _Texels:
         NoV, phi = max(float(cells[0]), source.LEAST_COSINE), float(cells[1])
         sine = math.sqrt((1 - NoV) * (1 + NoV))
         v = np.array([sine * math.cos(phi), sine * math.sin(phi), NoV])
-        face, row, column = np.meshgrid(np.arange(self.faces), np.arange(self.rows), np.arange(self.columns),
-                                        indexing="ij")
+        face, row, column = np.meshgrid(
+            np.arange(self.faces), np.arange(self.rows), np.arange(self.columns), indexing="ij"
+        )
         parts = np.stack([face.ravel(), row.ravel(), column.ravel(), np.ones(face.size), np.ones(face.size)], 1)
         parts = parts.astype(np.float64)
         split = self._too_large(parts, v, widths)
@@ -595,8 +688,9 @@ class _Texels:
         done, parts = [], parts[split]
         while len(parts):
             half = parts[:, 3:] / 2
-            parts = np.concatenate([np.concatenate([parts[:, :1], parts[:, 1:3] + half * [a, b], half], 1)
-                                    for a in (0, 1) for b in (0, 1)])
+            parts = np.concatenate(
+                [np.concatenate([parts[:, :1], parts[:, 1:3] + half * [a, b], half], 1) for a in (0, 1) for b in (0, 1)]
+            )
             split = self._too_large(parts, v, widths) & (parts[:, 3] > 2.0**-40) & (len(parts) < MOST_PARTS)
             done.append(parts[~split])
             parts = parts[split]
@@ -643,7 +737,7 @@ class _Texels:
         weights = np.repeat(w, edge) * np.tile(w, edge)
         step = max(1, BAND // edge**2)
         for begin in range(0, len(parts), step):
-            some = parts[begin:begin + step, :, None]
+            some = parts[begin : begin + step, :, None]
             face = np.broadcast_to(some[:, 0], (len(some), edge**2))
             i, j = some[:, 1] + a * some[:, 3], some[:, 2] + b * some[:, 4]
             texel = (face * self.rows + np.floor(some[:, 1])) * self.columns + np.floor(some[:, 2])
@@ -697,7 +791,7 @@ class _Texels:
             cells, terms, table = self.whole.cells(rows[:, index], precision)
             alone = "ndf" in task.models or "brdf" in task.models
             # Diffuse models see every texel alike and go together; a lobe has its own close texels for each view.
-            for some in ([np.array([k]) for k in range(len(index))] if alone else [np.arange(len(index))]):
+            for some in [np.array([k]) for k in range(len(index))] if alone else [np.arange(len(index))]:
                 group = cells[:, some]
                 skip, parts = self.close(group[:2, 0], widths[index[some[0]]]) if alone else (None, np.empty((0, 5)))
                 before: np.ndarray | None = None

@@ -4,6 +4,7 @@ A kernel calls a model by the name of its slot: `NDF_D`, `MASKING_V`, `FRESNEL_F
 model a slot and writes `#define NDF_D_FRONT(a0, a1) (ndf_ggx_D(a0, a1, ndf_alpha))`, so that a program holds exactly
 the models that it needs.
 """
+
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -100,14 +101,18 @@ def bindings(slots: Mapping[str, Model], *, cells: Sequence[str] = ("NoV",), are
     slot's function carries the parameters of that slot too.
     """
     isotropic = is_isotropic(slots)
-    own: dict[str, list[Declared]] = {slot: [("real", f"{slot}_{name}") for name in entry.arguments]
-                                      for slot, entry in slots.items()}
-    table: list[Declared] = [*(("real", name) for name in AREA_NUMBERS),
-                             ("const real *", "ndf_area_terms")] if area_terms else []
-    lines = [f"#define DIRECTION {'real' if isotropic else 'real3'}",
-             f"#define COS_OF(d) {'(d)' if isotropic else '((d).z)'}",
-             *([] if isotropic else ["#define ANISOTROPIC"]),
-             *([f"#define AREA_TERMS {area_terms}"] if area_terms else [])]
+    own: dict[str, list[Declared]] = {
+        slot: [("real", f"{slot}_{name}") for name in entry.arguments] for slot, entry in slots.items()
+    }
+    table: list[Declared] = (
+        [*(("real", name) for name in AREA_NUMBERS), ("const real *", "ndf_area_terms")] if area_terms else []
+    )
+    lines = [
+        f"#define DIRECTION {'real' if isotropic else 'real3'}",
+        f"#define COS_OF(d) {'(d)' if isotropic else '((d).z)'}",
+        *([] if isotropic else ["#define ANISOTROPIC"]),
+        *([f"#define AREA_TERMS {area_terms}"] if area_terms else []),
+    ]
     for slot, entry in slots.items():
         lines += _list_lines(slot, entry, own, table)
         for function in entry.provides:
@@ -125,9 +130,11 @@ def _list_lines(slot: str, entry: Model, own: Mapping[str, list[Declared]], tabl
         listed = listed + table
     plain = [n for n in listed if n not in table]
     upper = slot.upper()
-    return [f"#define {upper}_PARAMETERS " + "".join(f", {kind} {name}" for kind, name in listed),
-            f"#define {upper}_VALUES " + "".join(f", {name}" for _, name in listed),
-            f"#define {upper}_SCALARS " + "".join(f", const scalar {name}" for _, name in plain)]
+    return [
+        f"#define {upper}_PARAMETERS " + "".join(f", {kind} {name}" for kind, name in listed),
+        f"#define {upper}_VALUES " + "".join(f", {name}" for _, name in listed),
+        f"#define {upper}_SCALARS " + "".join(f", const scalar {name}" for _, name in plain),
+    ]
 
 
 def _function_lines(slot: str, entry: Model, function: str, isotropic: bool) -> list[str]:
@@ -144,8 +151,11 @@ def _function_lines(slot: str, entry: Model, function: str, isotropic: bool) -> 
     if function != "NDF_D":
         return [f"#define {function}{head} {call}"]
     # D is 0 for backfacing m, whatever the model, and that of a user's file is divided by its norm: said once.
-    front = ("#define NDF_D(a0, a1) ((a0) > 0 ? NDF_D_FRONT(a0, a1) : (real)0)" if isotropic else
-             "#define NDF_D(a0) ((a0).z > 0 ? NDF_D_FRONT(a0) : (real)0)")
+    front = (
+        "#define NDF_D(a0, a1) ((a0) > 0 ? NDF_D_FRONT(a0, a1) : (real)0)"
+        if isotropic
+        else "#define NDF_D(a0) ((a0).z > 0 ? NDF_D_FRONT(a0) : (real)0)"
+    )
     return [front, f"#define NDF_D_FRONT{head} ({'' if entry.text is None else 'ndf_per_norm * '}{call})"]
 
 
@@ -171,11 +181,17 @@ def _cell_lines(cells: Iterable[str], numbers: list[Declared], table: list[Decla
     loads = [f"const real {name} = LOAD(g, cell_values + (size_t){k} * cells);" for k, name in enumerate(rows)]
     if table:
         first = len(rows)
-        loads += [f"const real {name} = LOAD(g, cell_values + (size_t){first + k} * cells);"
-                  for k, name in enumerate(AREA_NUMBERS)]
-        loads.append(f"real ndf_area_terms[AREA_TERMS]; for (int k = 0; k < AREA_TERMS; k++) "
-                     f"ndf_area_terms[k] = LOAD(g, cell_values + (size_t)({first + len(AREA_NUMBERS)} + k) * cells);")
-    return ["#define CELL_PARAMETERS " + "".join(f", {kind} {name}" for kind, name in [*numbers, *table]),
-            "#define CELL_VALUES " + "".join(f", {name}" for _, name in [*numbers, *table]),
-            "#define CELL_ARRAYS , __global const scalar *restrict cell_values",
-            "#define CELL_LOAD " + " ".join(loads)]
+        loads += [
+            f"const real {name} = LOAD(g, cell_values + (size_t){first + k} * cells);"
+            for k, name in enumerate(AREA_NUMBERS)
+        ]
+        loads.append(
+            f"real ndf_area_terms[AREA_TERMS]; for (int k = 0; k < AREA_TERMS; k++) "
+            f"ndf_area_terms[k] = LOAD(g, cell_values + (size_t)({first + len(AREA_NUMBERS)} + k) * cells);"
+        )
+    return [
+        "#define CELL_PARAMETERS " + "".join(f", {kind} {name}" for kind, name in [*numbers, *table]),
+        "#define CELL_VALUES " + "".join(f", {name}" for _, name in [*numbers, *table]),
+        "#define CELL_ARRAYS , __global const scalar *restrict cell_values",
+        "#define CELL_LOAD " + " ".join(loads),
+    ]

@@ -3,6 +3,7 @@
 Each group below becomes one generated piece of a program's text (`opencl.source`), so a kernel file never repeats a
 value. A changed constant changes the text and the digest of every program that uses it.
 """
+
 from __future__ import annotations
 
 from math import factorial
@@ -52,5 +53,4 @@ def anterpolation_defines() -> str:
 
 def class_defines() -> str:
     """Return the `#define` lines of `octahedral.cl`: the edges of tiles and runs, and how many classes they hold."""
-    return (f"#define TILE_EDGE {TILE_EDGE}\n#define RUN_EDGE {RUN_EDGE}\n"
-            f"#define TILE {TILE}\n#define RUN {RUN}\n")
+    return f"#define TILE_EDGE {TILE_EDGE}\n#define RUN_EDGE {RUN_EDGE}\n#define TILE {TILE}\n#define RUN {RUN}\n"

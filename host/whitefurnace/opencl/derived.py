@@ -1,4 +1,5 @@
 """Numbers that kernels need beside a model's parameters: constants, a user's norm, tables of Smith's area."""
+
 from __future__ import annotations
 
 import math
@@ -77,12 +78,13 @@ def finest(device: Device) -> int:
 def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.ndarray:
     """(2, n): 1/norm of a user's D and the angle that holds half of its energy."""
     precision = finest(device)
-    theta = np.concatenate([[0.0], np.geomspace(1e-6, math.pi / 4, 600),
-                            math.pi / 2 - np.geomspace(math.pi / 4, 1e-6, 400)])
+    theta = np.concatenate(
+        [[0.0], np.geomspace(1e-6, math.pi / 4, 600), math.pi / 2 - np.geomspace(math.pi / 4, 1e-6, 400)]
+    )
     ones = np.ones((2, 1))
     widths = np.empty(distinct.shape[1])
     for k in range(distinct.shape[1]):
-        own = np.repeat(np.concatenate([distinct[:, k:k + 1], ones]), theta.size, 1)
+        own = np.repeat(np.concatenate([distinct[:, k : k + 1], ones]), theta.size, 1)
         cells = np.concatenate([np.stack([np.cos(theta), np.sin(theta) ** 2]), own])
         D = evaluate(device, "NDF_D", {"ndf": entry}, cells, precision)[0].astype(np.float64)
         refuse_bad(entry, D, theta)
@@ -93,12 +95,15 @@ def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.nd
     cells = np.concatenate([np.ones((1, distinct.shape[1])), distinct, np.ones((1, distinct.shape[1])), widths[None]])
     program = source.integration(integral("normalization"), {"ndf": entry}).text
     rules = LADDERS["polar"][-2:]
-    coarse, fine = (over_nodes(device, program, "integrate", cells, 1, precision, rule)[0].astype(np.float64)
-                    for rule in rules)
+    coarse, fine = (
+        over_nodes(device, program, "integrate", cells, 1, precision, rule)[0].astype(np.float64) for rule in rules
+    )
     if not (np.abs(fine - coarse) <= CONVERGED * np.abs(fine)).all():
-        raise InputError(f"{entry.path}: cannot be normalized: ∫ D(m)(n·m) dω does not converge (two fine rules give "
-                         f"{coarse.max():.4g} and {fine.max():.4g}); D must grow slower than 1/cos²θ at grazing and be "
-                         "wider than 1e-6 rad")
+        raise InputError(
+            f"{entry.path}: cannot be normalized: ∫ D(m)(n·m) dω does not converge (two fine rules give "
+            f"{coarse.max():.4g} and {fine.max():.4g}); D must grow slower than 1/cos²θ at grazing and be "
+            "wider than 1e-6 rad"
+        )
     return np.stack([1 / fine, widths])
 
 
@@ -134,7 +139,7 @@ class Areas:
         # Every term costs a lane a multiply-add for each light direction: with all of them GGX is 10 times as fast.
         length = max(16, 8 * math.ceil(int((rest > max(AREA_KEPT[self.precision], tolerance / 10)).sum()) / 8))
         cut = float(rest[length]) if length < rest.size else 0.0
-        return AreaTable(made[:3 + length, which], length, cut + max(self._made[key][1] for key in keys))
+        return AreaTable(made[: 3 + length, which], length, cut + max(self._made[key][1] for key in keys))
 
     def _make(self, distinct: np.ndarray, keys: list[bytes]) -> None:
         precision, count, n = finest(self.device), AREA_NODES[self.precision], distinct.shape[1]
@@ -144,8 +149,9 @@ class Areas:
             """(m, n) areas at cosines (m, n) by one of the two rules."""
             m = NoV.shape[0]
             cells = np.concatenate([NoV.reshape(1, -1), np.tile(distinct, m)])
-            values = over_nodes(self.device, program, "area", cells, 1, precision, AREA_RULES[self.precision][rule],
-                                azimuths=False)
+            values = over_nodes(
+                self.device, program, "area", cells, 1, precision, AREA_RULES[self.precision][rule], azimuths=False
+            )
             return values.reshape(m, n).astype(np.float64)
 
         zero, width = area(np.zeros((1, n)), 1)[0], self._widths(distinct)
@@ -154,10 +160,14 @@ class Areas:
             worst = distinct[:, np.abs(zero / coarse - 1).argmax()]
             where = dict(zip(self.entry.arguments, worst.tolist(), strict=True))
             own = ", ".join(f"{p.name} = {where[p.name]:g}" for p in self.entry.parameters)
-            why = "not a number, since D is not one somewhere" if np.isnan(zero + coarse).any() else \
-                "infinite, since D grows like 1/cos θ at grazing or faster"
-            raise UnsupportedError(f"ndf {self.entry.name} has no Smith masking{' for ' if own else ''}{own}: its "
-                                   f"projected area is {why}")
+            why = (
+                "not a number, since D is not one somewhere"
+                if np.isnan(zero + coarse).any()
+                else "infinite, since D grows like 1/cos θ at grazing or faster"
+            )
+            raise UnsupportedError(
+                f"ndf {self.entry.name} has no Smith masking{' for ' if own else ''}{own}: its projected area is {why}"
+            )
         scale = np.maximum(np.minimum(zero, width), 1e-7)
         angle = (np.arange(count) + 0.5) * math.pi / count
         q = (1 - np.cos(angle)) / 2
@@ -193,8 +203,17 @@ def lobe_norm(device: Device, entry: Model, parameters: Mapping[str, float]) -> 
         D = entry.reference["D"](np.arcsin(np.sqrt(s / 2)), **parameters)
         return 2 * math.pi * float((width * w * D * (1 - s)).sum())
     cells = np.concatenate([np.ones((1, 1)), numbers_of(device, entry, _row(entry, parameters))])
-    return float(over_nodes(device, source.integration(LOBE, {"ndf": entry}).text, "integrate", cells, 1,
-                            finest(device), LADDERS["polar"][-1])[0, 0])
+    return float(
+        over_nodes(
+            device,
+            source.integration(LOBE, {"ndf": entry}).text,
+            "integrate",
+            cells,
+            1,
+            finest(device),
+            LADDERS["polar"][-1],
+        )[0, 0]
+    )
 
 
 def at_horizon(device: Device, entry: Model, parameters: Mapping[str, float]) -> float:

@@ -1,4 +1,5 @@
 """Finds the OpenCL devices that really work, chooses one, builds kernels and runs them: the only door to pyopencl."""
+
 from __future__ import annotations
 
 import atexit
@@ -49,8 +50,14 @@ TUNING = {
 
 # What CPU runtimes read when they are loaded: PoCL to 4 and from 5, Intel's, and last the host's own libraries (numpy's
 # linear algebra, OpenImageIO).
-CORE_LIMITS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT", "DPCPP_CPU_NUM_CUS", "CL_CONFIG_CPU_TBB_NUM_WORKERS",
-               "OMP_NUM_THREADS", "OPENIMAGEIO_THREADS")
+CORE_LIMITS = (
+    "POCL_MAX_PTHREAD_COUNT",
+    "POCL_CPU_MAX_CU_COUNT",
+    "DPCPP_CPU_NUM_CUS",
+    "CL_CONFIG_CPU_TBB_NUM_WORKERS",
+    "OMP_NUM_THREADS",
+    "OPENIMAGEIO_THREADS",
+)
 
 # Launches in flight: enough to keep a device busy; few, so that Ctrl-C is heard within seconds and
 # unwaited profiling events do not pile up.
@@ -272,11 +279,17 @@ def find_devices() -> list[Candidate]:
     candidates = []
     for index, raw in enumerate(_list_devices()):
         device, verdict = _try(raw)
-        candidates.append(Candidate(
-            index=index, name=raw.name.strip(), platform=raw.platform.name.strip(),
-            driver=raw.driver_version.strip(), type=_kind(raw), verdict=verdict,
-            fp64=device is not None and device.fp64,
-        ))
+        candidates.append(
+            Candidate(
+                index=index,
+                name=raw.name.strip(),
+                platform=raw.platform.name.strip(),
+                driver=raw.driver_version.strip(),
+                type=_kind(raw),
+                verdict=verdict,
+                fp64=device is not None and device.fp64,
+            )
+        )
     return candidates
 
 
@@ -300,8 +313,11 @@ def choose_device(name: str | None = None) -> Device:
             wanted = addressed
         else:
             labels = [_label(raw).lower() for raw in listed]
-            wanted = [raw for raw, label in zip(listed, labels, strict=True)
-                      if text in label or text in label.replace(":", "")]
+            wanted = [
+                raw
+                for raw, label in zip(listed, labels, strict=True)
+                if text in label or text in label.replace(":", "")
+            ]
         if not wanted:
             there = ", ".join(f"{index} = {_label(raw)}" for index, raw in enumerate(listed))
             raise UsageError(f"no OpenCL device is called {name!r}; there are: {there}")
@@ -313,8 +329,9 @@ def choose_device(name: str | None = None) -> Device:
         refused.append(f"{_label(raw)} was refused ({verdict})")
     if not listed:
         refused = ["no OpenCL platform was found"]
-    raise DeviceError(f"no OpenCL device {'called ' + repr(name) + ' ' if name else ''}works: "
-                      f"{'; '.join(refused)}; {INSTALL}")
+    raise DeviceError(
+        f"no OpenCL device {'called ' + repr(name) + ' ' if name else ''}works: {'; '.join(refused)}; {INSTALL}"
+    )
 
 
 def device_address(name: str | None = None) -> str:
@@ -332,8 +349,9 @@ def device_address(name: str | None = None) -> str:
 class Buffer:
     """An array in the device's memory; made by `Device.array` and `Device.empty`."""
 
-    def __init__(self, device: Device, memory: Any, shape: tuple[int, ...], dtype: np.dtype[Any],
-                 shared: np.ndarray | None) -> None:
+    def __init__(
+        self, device: Device, memory: Any, shape: tuple[int, ...], dtype: np.dtype[Any], shared: np.ndarray | None
+    ) -> None:
         self.device = device
         self.shape = shape
         self.dtype = dtype
@@ -356,8 +374,7 @@ class Buffer:
         Raises ValueError for another shape or dtype and DeviceError if a launch failed.
         """
         if values.shape != self.shape or values.dtype != self.dtype:
-            raise ValueError(f"a buffer of {self.dtype} {self.shape} cannot take "
-                             f"{values.dtype} {values.shape}")
+            raise ValueError(f"a buffer of {self.dtype} {self.shape} cannot take {values.dtype} {values.shape}")
         self.device.finish()
         values = np.ascontiguousarray(values)
         if self._shared is not None:  # the caller's array must not change: take memory of our own
@@ -377,10 +394,12 @@ class Kernel:
         self._raw = raw
         with _translated(device, f"kernel {name}"):
             self.work_group_limit = int(
-                raw.get_work_group_info(_opencl().kernel_work_group_info.WORK_GROUP_SIZE, device._raw))
+                raw.get_work_group_info(_opencl().kernel_work_group_info.WORK_GROUP_SIZE, device._raw)
+            )
 
-    def __call__(self, global_size: tuple[int, ...], *args: Buffer | np.generic | None,
-                 local_size: tuple[int, ...] | None = None) -> None:
+    def __call__(
+        self, global_size: tuple[int, ...], *args: Buffer | np.generic | None, local_size: tuple[int, ...] | None = None
+    ) -> None:
         self.device.launch(self, global_size, args, local_size)
 
 
@@ -461,8 +480,7 @@ class Device:
         self._lock = threading.RLock()
         with _translated(self, "making a context"):
             self._context = cl.Context([raw])
-            self._queue = cl.CommandQueue(
-                self._context, raw, properties=cl.command_queue_properties.PROFILING_ENABLE)
+            self._queue = cl.CommandQueue(self._context, raw, properties=cl.command_queue_properties.PROFILING_ENABLE)
         _live.add(self)
 
     def __repr__(self) -> str:
@@ -511,8 +529,13 @@ class Device:
 
     def identity(self) -> dict[str, str]:
         """Return what a manifest records of the device: name, platform, driver, version, type."""
-        return {"name": self.name, "platform": self.platform, "driver": self.driver, "version": self.version,
-                "type": self.type}
+        return {
+            "name": self.name,
+            "platform": self.platform,
+            "driver": self.driver,
+            "version": self.version,
+            "type": self.type,
+        }
 
     def build(self, text: str, options: Mapping[str, int | float | str] | None = None) -> Program:
         """Build OpenCL C 1.2 `text` and return the program, the same one for the same text and options.
@@ -538,13 +561,16 @@ class Device:
                 self._programs[key] = Program(self, raw)
             return self._programs[key]
 
-    def _allocate(self, shape: tuple[int, ...], dtype: np.dtype[Any], values: np.ndarray | None, *,
-                  writable: bool, share: bool) -> Buffer:
+    def _allocate(
+        self, shape: tuple[int, ...], dtype: np.dtype[Any], values: np.ndarray | None, *, writable: bool, share: bool
+    ) -> Buffer:
         cl = _opencl()
         nbytes = math.prod(map(int, shape)) * dtype.itemsize
         if nbytes > self.max_allocation:
-            raise DeviceError(f"a buffer of {nbytes / 2**20:.1f} MiB is above the largest that {self.name} "
-                              f"takes, {self.max_allocation / 2**20:.1f} MiB")
+            raise DeviceError(
+                f"a buffer of {nbytes / 2**20:.1f} MiB is above the largest that {self.name} "
+                f"takes, {self.max_allocation / 2**20:.1f} MiB"
+            )
         flags = cl.mem_flags.READ_WRITE if writable else cl.mem_flags.READ_ONLY
         try:
             if values is None or not nbytes:
@@ -563,8 +589,7 @@ class Device:
         do not change it while the buffer lives. Raises DeviceError where there is no room.
         """
         values = np.ascontiguousarray(values).reshape(np.shape(values))
-        share = (self.type == "cpu" and not writable and values.nbytes > 0
-                 and values.ctypes.data % self._alignment == 0)
+        share = self.type == "cpu" and not writable and values.nbytes > 0 and values.ctypes.data % self._alignment == 0
         return self._allocate(values.shape, values.dtype, values, writable=writable, share=share)
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Buffer:
@@ -578,10 +603,15 @@ class Device:
         nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
         raw = np.empty(nbytes + self._alignment, np.uint8)
         start = -raw.ctypes.data % self._alignment
-        return raw[start:start + nbytes].view(dtype).reshape(shape)
+        return raw[start : start + nbytes].view(dtype).reshape(shape)
 
-    def launch(self, kernel: Kernel, global_size: tuple[int, ...], args: Sequence[Buffer | np.generic | None],
-               local_size: tuple[int, ...] | None = None) -> None:
+    def launch(
+        self,
+        kernel: Kernel,
+        global_size: tuple[int, ...],
+        args: Sequence[Buffer | np.generic | None],
+        local_size: tuple[int, ...] | None = None,
+    ) -> None:
         """Enqueue `kernel` over `global_size` work items; nothing is padded.
 
         args: buffers of this device, numpy scalars of the kernel's types, or None for a null pointer. local_size: by
@@ -593,8 +623,9 @@ class Device:
             first //= 2
         local_size = (first, *rest)
         if any(n % m or n < 1 for n, m in zip(global_size, local_size, strict=True)):
-            raise DeviceError(f"kernel {kernel.name}: the global size {global_size} is not a multiple of the "
-                              f"local size {local_size}")
+            raise DeviceError(
+                f"kernel {kernel.name}: the global size {global_size} is not a multiple of the local size {local_size}"
+            )
         with self._lock, _translated(self, f"kernel {kernel.name}"):
             kernel._raw.set_args(*(arg._memory if isinstance(arg, Buffer) else arg for arg in args))
             event = _opencl().enqueue_nd_range_kernel(self._queue, kernel._raw, global_size, local_size)
@@ -628,8 +659,9 @@ class Device:
         items, terms, a, bend = 2 * self.local_size, 8, 0.75, 20.0
         x = np.linspace(0.5, 30, items * lanes).astype(scalar)
         result = self.empty(x.shape, scalar)
-        self.launch(program.kernel("probe"), (items,),
-                    [self.array(x), result, scalar(a), scalar(bend), np.int32(terms)])
+        self.launch(
+            program.kernel("probe"), (items,), [self.array(x), result, scalar(a), scalar(bend), np.int32(terms)]
+        )
         total = a * np.sqrt(x.astype(np.float64)[:, None] + np.arange(terms)).sum(1)
         wanted = np.where(total > bend, 1 / total, total)
         # Roots of at most 3 ulp, the roundings of their sum and a division of 2.5 ulp (OpenCL 1.2, 7.4).

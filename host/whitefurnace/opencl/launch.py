@@ -1,4 +1,5 @@
 """Launches of kernels over cells: rows of numbers, one cell a lane, in blocks of bounded size."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -13,8 +14,15 @@ from whitefurnace.opencl.device import Device
 CELLS_A_LAUNCH = 1 << 16
 
 
-def over_cells(device: Device, text: str, kernel: str, cells: np.ndarray, components: int, precision: int,
-               between: Sequence[np.generic | np.ndarray] = ()) -> np.ndarray:
+def over_cells(
+    device: Device,
+    text: str,
+    kernel: str,
+    cells: np.ndarray,
+    components: int,
+    precision: int,
+    between: Sequence[np.generic | np.ndarray] = (),
+) -> np.ndarray:
     """Run a kernel over cells and return its values, (components, n), in the working precision.
 
     cells: (rows, n) float64, one column a cell. components: numbers that the kernel writes for each cell. precision: 32
@@ -28,18 +36,26 @@ def over_cells(device: Device, text: str, kernel: str, cells: np.ndarray, compon
     out = np.empty((components, cells.shape[1]), kind)
     step = lanes * device.local_size
     for begin in range(0, cells.shape[1], CELLS_A_LAUNCH):
-        part = cells[:, begin:begin + CELLS_A_LAUNCH]
+        part = cells[:, begin : begin + CELLS_A_LAUNCH]
         count = part.shape[1]
         padded = -(-count // step) * step
         block = np.pad(part, ((0, 0), (0, padded - count)), mode="edge").astype(kind)
         result = device.empty((components, padded), kind)
         device.launch(bound, (padded // lanes,), (result, np.int32(padded), *sent, device.array(block)))
-        out[:, begin:begin + count] = result.read()[:, :count]
+        out[:, begin : begin + count] = result.read()[:, :count]
     return out
 
 
-def over_nodes(device: Device, text: str, kernel: str, cells: np.ndarray, components: int, precision: int,
-               rule: Rule, azimuths: bool = True) -> np.ndarray:
+def over_nodes(
+    device: Device,
+    text: str,
+    kernel: str,
+    cells: np.ndarray,
+    components: int,
+    precision: int,
+    rule: Rule,
+    azimuths: bool = True,
+) -> np.ndarray:
     """Run a kernel that sums over the nodes of a quadrature rule: `over_cells` with the rule's tables between.
 
     azimuths: whether the kernel takes the nodes of the azimuth too.
@@ -51,8 +67,9 @@ def over_nodes(device: Device, text: str, kernel: str, cells: np.ndarray, compon
     return over_cells(device, text, kernel, cells, components, precision, between)
 
 
-def evaluate(device: Device, function: str, slots: Mapping[str, Model], cells: np.ndarray,
-             precision: int, area_terms: int = 0) -> np.ndarray:
+def evaluate(
+    device: Device, function: str, slots: Mapping[str, Model], cells: np.ndarray, precision: int, area_terms: int = 0
+) -> np.ndarray:
     """Evaluate a function of a model at its own arguments on the device: (components, n).
 
     function: its name as kernels call it (`NDF_D`, `FRESNEL_F`, …). slots: the models of the program. cells: (rows, n),
@@ -60,5 +77,6 @@ def evaluate(device: Device, function: str, slots: Mapping[str, Model], cells: n
     table of Smith's area of `area_terms` terms where the masking reads one. precision: 32 or 64.
     """
     components = 3 if function == "BRDF_F" else 1
-    return over_cells(device, source.evaluation(function, slots, area_terms).text, "evaluate", cells, components,
-                      precision)
+    return over_cells(
+        device, source.evaluation(function, slots, area_terms).text, "evaluate", cells, components, precision
+    )

@@ -4,6 +4,7 @@
 models, `octahedral` for the convolution of levels. Every file stands under its own `#line`, so that a compiler's
 message names the file.
 """
+
 from __future__ import annotations
 
 import hashlib
@@ -64,81 +65,115 @@ PROGRAMS: Mapping[str, Assembly] = {
     # Integrals over models, one value a cell.
     "integral": Assembly(
         ("real.clh", *_MODELS, "facet.clh", "ring.clh", "integrand/{integral}.clh", "integrate.cl"),
-        slots=_MICROFACETS, defines=("{support}",)),
+        slots=_MICROFACETS,
+        defines=("{support}",),
+    ),
     "integral of an anisotropic NDF": Assembly(
         ("real.clh", *_MODELS, "facet.clh", "integrand/{integral}.clh", "stretched.cl"),
-        slots=_MICROFACETS, cells=("NoV", "phi"), defines=("{support}",)),
-    "integral in closed form": Assembly(
-        ("real.clh", *_MODELS, "{file}"), slots=("ndf", "masking")),
+        slots=_MICROFACETS,
+        cells=("NoV", "phi"),
+        defines=("{support}",),
+    ),
+    "integral in closed form": Assembly(("real.clh", *_MODELS, "{file}"), slots=("ndf", "masking")),
     "fit of linearly transformed cosines": Assembly(
         ("real.clh", *_MODELS, "facet.clh", "ring.clh", "specular.clh", "ltc.cl"),
-        slots=_MICROFACETS, cells=("NoV", "per_albedo", "xx", "xz", "zx", "zz"), defines=("HALF_ANGLE",)),
-    "rough boundary": Assembly(
-        ("real.clh", *_MODELS, "glass.cl"), slots=_MICROFACETS),
+        slots=_MICROFACETS,
+        cells=("NoV", "per_albedo", "xx", "xz", "zx", "zz"),
+        defines=("HALF_ANGLE",),
+    ),
+    "rough boundary": Assembly(("real.clh", *_MODELS, "glass.cl"), slots=_MICROFACETS),
     "table of Smith's area": Assembly(
-        ("real.clh", *_MODELS, "ring.clh", "area.cl"), slots=("ndf",), defines=("POLAR",)),
+        ("real.clh", *_MODELS, "ring.clh", "area.cl"), slots=("ndf",), defines=("POLAR",)
+    ),
     "albedo of a diffuse model": Assembly(
         ("real.clh", *_MODELS, "<scatter>", "hemisphere.cl"),
-        slots=("diffuse",), defines=("SMOOTH", "AZIMUTH_PANELS 2", "COMPONENTS 1", _WIDTH, _LEAST)),
+        slots=("diffuse",),
+        defines=("SMOOTH", "AZIMUTH_PANELS 2", "COMPONENTS 1", _WIDTH, _LEAST),
+    ),
     "albedo of a whole BRDF": Assembly(
         ("real.clh", *_MODELS, "ring.clh", "<scatter>", "hemisphere.cl"),
-        slots=("brdf",), cells=("NoV", "phi"),
-        defines=("HALF_ANGLE", "AZIMUTH_PANELS 4", "COMPONENTS 3", _WIDTH, _LEAST)),
+        slots=("brdf",),
+        cells=("NoV", "phi"),
+        defines=("HALF_ANGLE", "AZIMUTH_PANELS 4", "COMPONENTS 3", _WIDTH, _LEAST),
+    ),
     "function of a model": Assembly(
-        ("real.clh", *_MODELS, "<evaluate>", "evaluate.cl"),
-        slots=(*_MICROFACETS, "diffuse", "brdf", "light"), cells=()),
+        ("real.clh", *_MODELS, "<evaluate>", "evaluate.cl"), slots=(*_MICROFACETS, "diffuse", "brdf", "light"), cells=()
+    ),
     "specular BRDF": Assembly(
-        ("real.clh", *_MODELS, "specular.clh", "<evaluate>", "evaluate.cl"), slots=_MICROFACETS, cells=()),
+        ("real.clh", *_MODELS, "specular.clh", "<evaluate>", "evaluate.cl"), slots=_MICROFACETS, cells=()
+    ),
     # Reflected radiance.
     "light on a specular surface": Assembly(
         ("real.clh", *_MODELS, "facet.clh", "radiance_outline.cl"),
-        slots=_MICROFACETS, cells=_OF_LIGHTS, defines=("COMPONENTS 1", _WIDTH, _LEAST)),
+        slots=_MICROFACETS,
+        cells=_OF_LIGHTS,
+        defines=("COMPONENTS 1", _WIDTH, _LEAST),
+    ),
     "light on a diffuse surface": Assembly(
         ("real.clh", *_MODELS, "<scatter>", "radiance_outline.cl"),
-        slots=("diffuse",), cells=_OF_LIGHTS, defines=("SMOOTH", "COMPONENTS 1", _WIDTH, _LEAST)),
+        slots=("diffuse",),
+        cells=_OF_LIGHTS,
+        defines=("SMOOTH", "COMPONENTS 1", _WIDTH, _LEAST),
+    ),
     "light on a whole BRDF": Assembly(
         ("real.clh", *_MODELS, "<scatter>", "radiance_outline.cl"),
-        slots=("brdf",), cells=_OF_LIGHTS, defines=("WHOLE", "COMPONENTS 3", _WIDTH, _LEAST)),
+        slots=("brdf",),
+        cells=_OF_LIGHTS,
+        defines=("WHOLE", "COMPONENTS 3", _WIDTH, _LEAST),
+    ),
     "environment on a surface": Assembly(
         ("real.clh", *_MODELS, "<scatter>", "radiance_nodes.cl"),
-        slots=("diffuse", "brdf"), cells=("NoV", "phi"), defines=(_LEAST,)),
+        slots=("diffuse", "brdf"),
+        cells=("NoV", "phi"),
+        defines=(_LEAST,),
+    ),
     "environment on a specular surface": Assembly(
         ("real.clh", *_MODELS, "specular.clh", "<scatter>", "radiance_nodes.cl"),
-        slots=(*_MICROFACETS, "diffuse"), cells=("NoV", "phi"), defines=(_LEAST,)),
-    "nodes in the frame of a surface": Assembly(
-        ("real.clh", "sphere.clh", "texels/{kind}.clh", "radiance_texels.cl")),
+        slots=(*_MICROFACETS, "diffuse"),
+        cells=("NoV", "phi"),
+        defines=(_LEAST,),
+    ),
+    "nodes in the frame of a surface": Assembly(("real.clh", "sphere.clh", "texels/{kind}.clh", "radiance_texels.cl")),
     "reflectance integral": Assembly(
         # samples.cl makes reals of what special.clh calls bits: one macro, of either.
         ("real.clh", "sphere.clh", *_MODELS, "<between>", "pyramid.cl", "samples.cl", "truth.cl"),
-        slots=(*_MICROFACETS, "diffuse"), cells=(), defines=("{how}", "SETS {sets}")),
+        slots=(*_MICROFACETS, "diffuse"),
+        cells=(),
+        defines=("{how}", "SETS {sets}"),
+    ),
     # Prefiltering.
     "convolution with an NDF": Assembly(
-        ("real.clh", *_MODELS, "window.clh", "lobe.clh", "prefilter.cl"), slots=("ndf",)),
-    "convolution with the cosine": Assembly(
-        ("real.clh", "window.clh", "lobe_cosine.clh", "prefilter.cl")),
+        ("real.clh", *_MODELS, "window.clh", "lobe.clh", "prefilter.cl"), slots=("ndf",)
+    ),
+    "convolution with the cosine": Assembly(("real.clh", "window.clh", "lobe_cosine.clh", "prefilter.cl")),
     "texels near a narrow lobe": Assembly(
-        ("real.clh", "sphere.clh", "texels/{kind}.clh", *_MODELS, "window.clh", "lobe.clh", "exact.cl"),
-        slots=("ndf",)),
+        ("real.clh", "sphere.clh", "texels/{kind}.clh", *_MODELS, "window.clh", "lobe.clh", "exact.cl"), slots=("ndf",)
+    ),
     "convolution by the symmetries of the cube": Assembly(
-        ("real.clh", "sphere.clh", "<classes>", "orbits.clh", "window.clh", "lobe_table.clh", "octahedral.cl")),
+        ("real.clh", "sphere.clh", "<classes>", "orbits.clh", "window.clh", "lobe_table.clh", "octahedral.cl")
+    ),
     "bright texels under an NDF": Assembly(
-        ("real.clh", "sphere.clh", "orbits.clh", *_MODELS, "lobe.clh", "apart.cl"), slots=("ndf",)),
-    "bright texels under the cosine": Assembly(
-        ("real.clh", "sphere.clh", "orbits.clh", "lobe_cosine.clh", "apart.cl")),
-    "interpolation": Assembly(
-        ("real.clh", "sphere.clh", "<grid>", "grid.clh", "interpolate.cl")),
+        ("real.clh", "sphere.clh", "orbits.clh", *_MODELS, "lobe.clh", "apart.cl"), slots=("ndf",)
+    ),
+    "bright texels under the cosine": Assembly(("real.clh", "sphere.clh", "orbits.clh", "lobe_cosine.clh", "apart.cl")),
+    "interpolation": Assembly(("real.clh", "sphere.clh", "<grid>", "grid.clh", "interpolate.cl")),
     "nodes and harmonics": Assembly(
-        ("real.clh", "sphere.clh", "texels/{kind}.clh", "<grid>", "grid.clh", "<anterpolation>", "anterpolate.cl",
-         "harmonics.cl")),
-    "importance sampling": Assembly(
-        ("real.clh", "sphere.clh", "pyramid.cl", "samples.cl")),
-    "means over texels": Assembly(
-        ("real.clh", "sphere.clh", "overlap.cl")),
+        (
+            "real.clh",
+            "sphere.clh",
+            "texels/{kind}.clh",
+            "<grid>",
+            "grid.clh",
+            "<anterpolation>",
+            "anterpolate.cl",
+            "harmonics.cl",
+        )
+    ),
+    "importance sampling": Assembly(("real.clh", "sphere.clh", "pyramid.cl", "samples.cl")),
+    "means over texels": Assembly(("real.clh", "sphere.clh", "overlap.cl")),
     # Others.
-    "built-in environment": Assembly(
-        ("real.clh", "demo.cl")),
-    "limits of a device": Assembly(
-        ("real.clh", "yardstick.cl")),
+    "built-in environment": Assembly(("real.clh", "demo.cl")),
+    "limits of a device": Assembly(("real.clh", "yardstick.cl")),
 }
 """Every program: its kernel files, the slots that it binds, and what its kernels are told."""
 
@@ -171,8 +206,15 @@ def everything() -> str:
     return digest.hexdigest()
 
 
-def assembled(program: str, slots: Mapping[str, Model] | None = None, area_terms: int = 0, *,
-              cells: Sequence[str] | None = None, pieces: Mapping[str, str] | None = None, **words: str) -> Source:
+def assembled(
+    program: str,
+    slots: Mapping[str, Model] | None = None,
+    area_terms: int = 0,
+    *,
+    cells: Sequence[str] | None = None,
+    pieces: Mapping[str, str] | None = None,
+    **words: str,
+) -> Source:
     """Return the text of a program of `PROGRAMS` with its digest.
 
     slots: the models that it binds. area_terms: length of the tabulated Smith area, 0 for none. cells: what a cell
@@ -271,8 +313,11 @@ def area(ndf: Model) -> Source:
 def hemisphere(entry: Model) -> Source:
     """Return the program of the directional albedo of a BRDF f(l, v): a diffuse model, or a user's whole BRDF."""
     program = "albedo of a diffuse model" if entry.slot == "diffuse" else "albedo of a whole BRDF"
-    return assembled(program, {entry.slot: entry}, pieces={
-        "scatter": _scatter("sum[0] += w * DIFFUSE_F(l, v);" if entry.slot == "diffuse" else _WHOLE)})
+    return assembled(
+        program,
+        {entry.slot: entry},
+        pieces={"scatter": _scatter("sum[0] += w * DIFFUSE_F(l, v);" if entry.slot == "diffuse" else _WHOLE)},
+    )
 
 
 def evaluation(function: str, slots: Mapping[str, Model], area_terms: int = 0) -> Source:
@@ -288,12 +333,19 @@ def evaluation(function: str, slots: Mapping[str, Model], area_terms: int = 0) -
         values.append(f"vec3({', '.join(f'cell_{n}' for n in names)})" if kind is VECTOR else f"cell_{names[0]}")
     call = f"{function}({', '.join(values)})" if values else function
     if function == "BRDF_F":
-        result = (f"const real3 f = {call}; STORE(f.x, g, out); STORE(f.y, g, out + (size_t)cells); "
-                  "STORE(f.z, g, out + 2 * (size_t)cells);")
+        result = (
+            f"const real3 f = {call}; STORE(f.x, g, out); STORE(f.y, g, out + (size_t)cells); "
+            "STORE(f.z, g, out + 2 * (size_t)cells);"
+        )
     else:
         result = f"STORE({call}, g, out);"
-    return assembled("specular BRDF" if function == "SPECULAR_F" else "function of a model", slots, area_terms,
-                     cells=rows, pieces={"evaluate": f"#define EVALUATE {result}\n"})
+    return assembled(
+        "specular BRDF" if function == "SPECULAR_F" else "function of a model",
+        slots,
+        area_terms,
+        cells=rows,
+        pieces={"evaluate": f"#define EVALUATE {result}\n"},
+    )
 
 
 # ---------------------------------------------------------------------------------------------- radiance
@@ -319,7 +371,7 @@ def outline(slots: Mapping[str, Model], area_terms: int = 0) -> Source:
     """Return the program of reflected radiance over the outline of an area light, for one summand of the BRDF."""
     if "ndf" in slots:
         return assembled("light on a specular surface", slots, area_terms)
-    program, components = (("light on a diffuse surface", 1) if "diffuse" in slots else ("light on a whole BRDF", 3))
+    program, components = ("light on a diffuse surface", 1) if "diffuse" in slots else ("light on a whole BRDF", 3)
     return assembled(program, slots, area_terms, pieces={"scatter": _scatter_of(slots, components)})
 
 
@@ -340,8 +392,9 @@ def truth(slots: Mapping[str, Model], how: str, sets: int, area_terms: int = 0) 
     slots: ndf, masking and fresnel, or diffuse. how: the macro that says how directions are drawn. sets: how many sets
     of the models' numbers it sums at once.
     """
-    return assembled("reflectance integral", slots, area_terms, how=how, sets=str(sets),
-                     pieces={"between": "#undef TO_REAL\n"})
+    return assembled(
+        "reflectance integral", slots, area_terms, how=how, sets=str(sets), pieces={"between": "#undef TO_REAL\n"}
+    )
 
 
 # ---------------------------------------------------------------------------------------------- prefiltering
@@ -350,8 +403,9 @@ def truth(slots: Mapping[str, Model], how: str, sets: int, area_terms: int = 0) 
 @_kept
 def convolution(ndf: Model | None) -> Source:
     """Return the zonal convolution with the lobe of an NDF, or with the cosine lobe of irradiance for None."""
-    return assembled("convolution with the cosine") if ndf is None else \
-        assembled("convolution with an NDF", {"ndf": ndf})
+    return (
+        assembled("convolution with the cosine") if ndf is None else assembled("convolution with an NDF", {"ndf": ndf})
+    )
 
 
 @_kept
@@ -372,8 +426,11 @@ def octahedral() -> Source:
 @_kept
 def apart(ndf: Model | None) -> Source:
     """Return the excess of bright texels under the lobe of an NDF, or under the cosine of irradiance for None."""
-    return assembled("bright texels under the cosine") if ndf is None else \
-        assembled("bright texels under an NDF", {"ndf": ndf})
+    return (
+        assembled("bright texels under the cosine")
+        if ndf is None
+        else assembled("bright texels under an NDF", {"ndf": ndf})
+    )
 
 
 @_kept

@@ -1,4 +1,5 @@
 """Estimates the errors of a level from a sample of its texels: error, worst and rmse."""
+
 from __future__ import annotations
 
 import math
@@ -16,8 +17,14 @@ def texel_errors(values: np.ndarray, reference: np.ndarray, mean: float) -> np.n
     return np.divide(difference, floor, out=np.zeros_like(difference, np.float64), where=floor > 0).max(1, initial=0.0)
 
 
-def statement(values: np.ndarray, reference: np.ndarray, sample: tuple[np.ndarray, np.ndarray],
-              solid_angle: np.ndarray, mean: float, total: int) -> tuple[float, float, float]:
+def statement(
+    values: np.ndarray,
+    reference: np.ndarray,
+    sample: tuple[np.ndarray, np.ndarray],
+    solid_angle: np.ndarray,
+    mean: float,
+    total: int,
+) -> tuple[float, float, float]:
     """The stated (error, worst, rmse) of a level, from a sample of its texels.
 
     `error` bounds the 99th percentile of the texel errors at 95 % confidence, by the uniform draw. `worst` is the

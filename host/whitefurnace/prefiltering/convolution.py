@@ -1,4 +1,5 @@
 """Prefilters one environment on a device, and computes the exact integrals that certify the result."""
+
 from __future__ import annotations
 
 import hashlib
@@ -73,8 +74,15 @@ class Convolver:
     two.
     """
 
-    def __init__(self, device: Device, environment: Environment, *, precision: int = 32, seed: str = "",
-                 progress: Progress | None = None) -> None:
+    def __init__(
+        self,
+        device: Device,
+        environment: Environment,
+        *,
+        precision: int = 32,
+        seed: str = "",
+        progress: Progress | None = None,
+    ) -> None:
         self.device = device
         self.precision = precision if precision == 32 or device.fp64 else 32
         self.kind = np.dtype(f"f{self.precision // 8}")
@@ -109,8 +117,9 @@ class Convolver:
             self._classes[key] = self._symmetries.classes(n, grid, exchanges)
         return self._classes[key]
 
-    def convolve(self, lobe: Lobe, shape: Shape, n: int, tolerance: float,
-                 share: tuple[float, ...] = (0.0, 1.0)) -> np.ndarray:
+    def convolve(
+        self, lobe: Lobe, shape: Shape, n: int, tolerance: float, share: tuple[float, ...] = (0.0, 1.0)
+    ) -> np.ndarray:
         """The level over all texels of `shape`, (dims, 3) float32, from the n × n grid and the bright texels.
 
         tolerance: of the level's error. share: progress before and after. Raises ValueError for an n that is not a
@@ -136,8 +145,16 @@ class Convolver:
                 s.unfold(level, found, None, None, s.apart(found, lobe, bright), 1 / lobe.norm, np.zeros(3))
         return level.read()
 
-    def _sum_parts(self, level: Buffer, lobe: Lobe, shape: Shape, n: int, bright: Buffer | None, error: float,
-                   share: tuple[float, ...]) -> None:
+    def _sum_parts(
+        self,
+        level: Buffer,
+        lobe: Lobe,
+        shape: Shape,
+        n: int,
+        bright: Buffer | None,
+        error: float,
+        share: tuple[float, ...],
+    ) -> None:
         """The lobe over the n × n grid and the list `bright`, part by part, into all of `level`; without the base where
         it is of nodes."""
         s, parts = self._symmetries, planning.parts_for(n, lobe.alpha, lobe.horizon)
@@ -154,8 +171,16 @@ class Convolver:
                 partial = s.empty(sum(splits), found) if some else None
                 for k, part in enumerate(some):
                     assert partial
-                    s.convolve(partial, sum(splits[:k]), splits[k], found, lobe, part,
-                               self._sources(part.grid, exchanges), error)
+                    s.convolve(
+                        partial,
+                        sum(splits[:k]),
+                        splits[k],
+                        found,
+                        lobe,
+                        part,
+                        self._sources(part.grid, exchanges),
+                        error,
+                    )
                 sums.append(partial)
             apart = s.apart(found, lobe, bright) if bright else None
             s.unfold(level, found, sums[0], sums[1], apart, 1 / lobe.norm, base)
@@ -164,14 +189,27 @@ class Convolver:
 
     def interpolate(self, level: Buffer, shape: Shape, grid: Buffer) -> None:
         """Writes into `level` the texels of `shape`, read from values at the nodes of `grid`, with the base added."""
-        kernel = self.device.build(source.interpolation().text, {
-            "W": 1, "T": 1, "PRECISION": self.precision}).kernel("interpolate")
+        kernel = self.device.build(source.interpolation().text, {"W": 1, "T": 1, "PRECISION": self.precision}).kernel(
+            "interpolate"
+        )
         size = self.device.scalar_size
         for first in range(0, shape.count, planning.TEXELS_A_LAUNCH):
             count = min(planning.TEXELS_A_LAUNCH, shape.count - first)
-            self.device.launch(kernel, (-(-count // size) * size,),
-                               (level, np.int32(first), np.int32(count), np.int32(shape.size), np.int32(shape.latlong),
-                                grid, np.int32(grid.shape[1]), *(self.real(b) for b in self.base)), (size,))
+            self.device.launch(
+                kernel,
+                (-(-count // size) * size,),
+                (
+                    level,
+                    np.int32(first),
+                    np.int32(count),
+                    np.int32(shape.size),
+                    np.int32(shape.latlong),
+                    grid,
+                    np.int32(grid.shape[1]),
+                    *(self.real(b) for b in self.base),
+                ),
+                (size,),
+            )
 
     # ------------------------------------------------------------------------------------------- exact integrals
 
@@ -184,10 +222,13 @@ class Convolver:
         `harmonics` needs them.
         """
         if any(directions.shape[1] > MOST_TOGETHER for _, directions in wanted):  # of a certificate of many texels
-            pieces = [np.array_split(directions, -(-directions.shape[1] // MOST_TOGETHER), 1)
-                      for _, directions in wanted]
-            return [np.concatenate([self.exact([(lobe, piece)], cuts, tolerance)[0] for piece in some])
-                    for (lobe, _), some in zip(wanted, pieces, strict=True)]
+            pieces = [
+                np.array_split(directions, -(-directions.shape[1] // MOST_TOGETHER), 1) for _, directions in wanted
+            ]
+            return [
+                np.concatenate([self.exact([(lobe, piece)], cuts, tolerance)[0] for piece in some])
+                for (lobe, _), some in zip(wanted, pieces, strict=True)
+            ]
         # Beyond the window of narrow lobes the sum errs by up to 3e-5.
         coarse = self.texels.centred and cuts > max(planning.CENTRED) and tolerance >= 1e-4
         if wanted and coarse and all(_narrow(lobe) for lobe, _ in wanted):
@@ -204,8 +245,10 @@ class Convolver:
                 sums[k] += self._list_sums(lobe, listed, count, block)
         if wants_harmonics:
             self._harmonics[cuts] = self._with_bright(coefficients)
-        return [self._value(lobe, block, total, tolerance, directions.shape[1])
-                for (lobe, block), total, (_, directions) in zip(jobs, sums, wanted, strict=True)]
+        return [
+            self._value(lobe, block, total, tolerance, directions.shape[1])
+            for (lobe, block), total, (_, directions) in zip(jobs, sums, wanted, strict=True)
+        ]
 
     def exact_narrow(self, lobe: Lobe, directions: np.ndarray, cuts: int, tolerance: float) -> np.ndarray:
         """As `exact`, for one lobe that is much narrower than a texel.
@@ -221,13 +264,24 @@ class Convolver:
         for listed, count, _ in self.texels.bands(parts):
             sums += self._list_sums(lobe, listed, count, block, window)
         for entry, numbers, weight in lobe.summands:
-            program = self.device.build(source.near_texels(self.environment.kind, entry).text, {
-                "W": self.device.lanes(self.precision), "T": 1, "PRECISION": self.precision})
+            program = self.device.build(
+                source.near_texels(self.environment.kind, entry).text,
+                {"W": self.device.lanes(self.precision), "T": 1, "PRECISION": self.precision},
+            )
             near = self.device.empty((block.shape[1], 4), self.kind)
             size = self.device.local_size
-            self.device.launch(program.kernel("convolve_texels"), (-(-block.shape[1] // size) * size,),
-                               (near, np.int32(block.shape[1]), block, *(self.real(x) for x in (*window, 1.01 * reach)),
-                                *self.texels.arguments(cuts), *(self.real(value) for value in numbers)))
+            self.device.launch(
+                program.kernel("convolve_texels"),
+                (-(-block.shape[1] // size) * size,),
+                (
+                    near,
+                    np.int32(block.shape[1]),
+                    block,
+                    *(self.real(x) for x in (*window, 1.01 * reach)),
+                    *self.texels.arguments(cuts),
+                    *(self.real(value) for value in numbers),
+                ),
+            )
             sums += weight * near.read().T
         return self._value(lobe, block, sums, tolerance, directions.shape[1])
 
@@ -257,20 +311,34 @@ class Convolver:
             value = value + self._list_sums(lobe, bright, bright.shape[0], block)[:3] / lobe.norm
         return value.T[:count] + self.base
 
-    def _list_sums(self, lobe: Lobe, listed: Buffer, count: int, block: Buffer,
-                   window: tuple[float, float] = (0.0, 0.0)) -> np.ndarray:
+    def _list_sums(
+        self, lobe: Lobe, listed: Buffer, count: int, block: Buffer, window: tuple[float, float] = (0.0, 0.0)
+    ) -> np.ndarray:
         """(4, outputs) float64: ∑K wL and ∑K w of a whole list, beyond a window where there is one, by the NDFs
         themselves."""
         outputs, splits = block.shape[1], -(-count // planning.CHUNK)
         step = self.device.lanes(self.precision) * self.device.vectors
         total = np.zeros((4, outputs))
         for entry, numbers, weight in lobe.summands or ((None, (), 1.0),):
-            program = self.device.build(source.convolution(entry).text, {
-                "W": self.device.lanes(self.precision), "T": self.device.vectors, "PRECISION": self.precision})
+            program = self.device.build(
+                source.convolution(entry).text,
+                {"W": self.device.lanes(self.precision), "T": self.device.vectors, "PRECISION": self.precision},
+            )
             partial = self.device.empty((splits, 4, outputs), self.kind)
-            self.device.launch(program.kernel("convolve"), (outputs // step, splits),
-                               (partial, np.int32(outputs), np.int32(count), np.int32(planning.CHUNK), block, listed,
-                                *(self.real(x) for x in window), *(self.real(value) for value in numbers)))
+            self.device.launch(
+                program.kernel("convolve"),
+                (outputs // step, splits),
+                (
+                    partial,
+                    np.int32(outputs),
+                    np.int32(count),
+                    np.int32(planning.CHUNK),
+                    block,
+                    listed,
+                    *(self.real(x) for x in window),
+                    *(self.real(value) for value in numbers),
+                ),
+            )
             total += weight * partial.read().sum(0, dtype=np.float64)
         return total
 

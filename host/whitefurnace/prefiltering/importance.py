@@ -1,4 +1,5 @@
 """Computes levels by filtered importance sampling: each texel takes N samples of the lobe from a pyramid of means."""
+
 from __future__ import annotations
 
 import math
@@ -54,8 +55,7 @@ class Sampler:
     whole.
     """
 
-    def __init__(self, means: Means, precision: int = 32,
-                 progress: Callable[[str, float], None] | None = None) -> None:
+    def __init__(self, means: Means, precision: int = 32, progress: Callable[[str, float], None] | None = None) -> None:
         self.means = means
         self.device = means.device
         self.precision = precision
@@ -68,8 +68,7 @@ class Sampler:
         self._pyramids: dict[int, Buffer] = {}
 
     def _kernel(self, name: str, lanes: int) -> Kernel:
-        return self.device.build(source.samples().text,
-                                 {"W": lanes, "T": 1, "PRECISION": self.precision}).kernel(name)
+        return self.device.build(source.samples().text, {"W": lanes, "T": 1, "PRECISION": self.precision}).kernel(name)
 
     def _launch(self, name: str, count: int, *args: Any) -> None:
         """A kernel of one lane over `count` items."""
@@ -108,17 +107,29 @@ class Sampler:
         order = shape.tiled()
         out = np.empty((shape.count, 3), np.float32)
         for begin in range(0, shape.count, tile):
-            index = order[begin:begin + tile]
+            index = order[begin : begin + tile]
             padded = -(-len(index) // step) * step
             part = np.pad(shape.directions(index), ((0, 0), (0, padded - len(index))), mode="edge")
             partial = device.empty((splits, 3, padded), self.kind)
-            device.launch(add, (padded // lanes, splits),
-                          (partial, np.int32(padded), np.int32(count), np.int32(flat), np.int32(CHUNK),
-                           device.array(part.astype(self.kind)), listed, np.int32(size), np.int32(size.bit_length()),
-                           pyramid))
+            device.launch(
+                add,
+                (padded // lanes, splits),
+                (
+                    partial,
+                    np.int32(padded),
+                    np.int32(count),
+                    np.int32(flat),
+                    np.int32(CHUNK),
+                    device.array(part.astype(self.kind)),
+                    listed,
+                    np.int32(size),
+                    np.int32(size.bit_length()),
+                    pyramid,
+                ),
+            )
             level = device.empty((3, padded), self.kind)
             device.launch(finish, (padded // lanes,), (level, np.int32(padded), partial, np.int32(splits)))
-            out[index] = level.read().T[:len(index)] + self.base
+            out[index] = level.read().T[: len(index)] + self.base
             self.progress(lobe.name, share[0] + (share[1] - share[0]) * (begin + len(index)) / shape.count)
         return out.reshape(*shape.dims, 3)
 

@@ -1,4 +1,5 @@
 """Derives from a recipe the levels to make: their plans, lobes and shapes."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -53,8 +54,16 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False, oc
             lobe = ndf_lobe(convolver.device, recipe.ndf, level.roughness, level.parameters)
         if lobe and (mixture or lobe.horizon > lobe.alpha):  # the plan is made for GGX's own lobe
             grid = planning.grid_size(lobe.alpha, recipe.tolerance, max(lobe.horizon, lobe.alpha))
-            level = replace(level, grid=level.grid and max(level.grid, grid), cuts=max(level.cuts, planning.cuts_for(
-                convolver.texel, lobe.alpha, recipe.tolerance, convolver.share, convolver.texels.centred)))
+            level = replace(
+                level,
+                grid=level.grid and max(level.grid, grid),
+                cuts=max(
+                    level.cuts,
+                    planning.cuts_for(
+                        convolver.texel, lobe.alpha, recipe.tolerance, convolver.share, convolver.texels.centred
+                    ),
+                ),
+            )
         jobs.append(Job(level, lobe, Shape(latlong, 2 * level.size if latlong else level.size, octahedral=octahedral)))
     return jobs
 

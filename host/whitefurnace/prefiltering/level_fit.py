@@ -12,6 +12,7 @@ background that is β of it, seen at every angle. A disc is zonal, so its exact 
 fit takes about 10 ms for GGX in 5 levels, 150 ms for a costly NDF or 12 levels. Real environments are not used in the
 fit; they test it (tests/prefiltering/test_reading.py).
 """
+
 from __future__ import annotations
 
 import math
@@ -184,14 +185,22 @@ def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
         a, b = np.tensordot(weights, gram, 2), np.tensordot(weights, right, 2)
         ridge = RIDGE * np.maximum(np.diag(a), 1e-6 * a.max())
         scale = 1 / a.max()
-        c = _constrained((a + np.diag(ridge)) * scale, (b + ridge * own) * scale, sums, allowed, least,
-                         level)
-    return (None, *(_mixture(c[level == k], own[level == k], allowed[level == k], nodes[level == k])
-                    for k in range(1, levels)))
+        c = _constrained((a + np.diag(ridge)) * scale, (b + ridge * own) * scale, sums, allowed, least, level)
+    return (
+        None,
+        *(_mixture(c[level == k], own[level == k], allowed[level == k], nodes[level == k]) for k in range(1, levels)),
+    )
 
 
-def _squares(steps: np.ndarray, level: np.ndarray, exact: np.ndarray, nodes: np.ndarray, mirror: np.ndarray,
-             omega: np.ndarray, floor: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _squares(
+    steps: np.ndarray,
+    level: np.ndarray,
+    exact: np.ndarray,
+    nodes: np.ndarray,
+    mirror: np.ndarray,
+    omega: np.ndarray,
+    floor: float,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of one scene, at each scored r: the quadratic form of the squared relative error in the weights, (r, p, p),
     (r, p) and (r,). exact: (angles, r); nodes: (angles, p); mirror: (angles, 1), what level 0 shows."""
     count = level.size
@@ -211,8 +220,9 @@ def _squares(steps: np.ndarray, level: np.ndarray, exact: np.ndarray, nodes: np.
     return gram, right, rest
 
 
-def _constrained(a: np.ndarray, b: np.ndarray, sums: np.ndarray, allowed: np.ndarray, least: np.ndarray,
-                 level: np.ndarray) -> np.ndarray:
+def _constrained(
+    a: np.ndarray, b: np.ndarray, sums: np.ndarray, allowed: np.ndarray, least: np.ndarray, level: np.ndarray
+) -> np.ndarray:
     """min ½cᵀac - bᵀc with sums @ c = 1 and every level's ∑ c·allowed ≥ least.
 
     A dual active-set method [Goldfarb1983]: the angles that are lowest are held as equalities, and any that then pull
@@ -227,7 +237,7 @@ def _constrained(a: np.ndarray, b: np.ndarray, sums: np.ndarray, allowed: np.nda
         # A little regularization, since two constrained angles may be nearly the same.
         system = np.block([[a, z.T], [z, -1e-13 * np.eye(len(z))]])
         solution = np.linalg.solve(system, np.concatenate([b, values]))
-        return solution[:count], solution[count + len(sums):]
+        return solution[:count], solution[count + len(sums) :]
 
     held: list[tuple[int, int]] = []
     c, pull = solved(held)

@@ -1,4 +1,5 @@
 """Makes levels, certifies them against exact integrals, and refines those that miss the tolerance."""
+
 from __future__ import annotations
 
 import contextlib
@@ -48,8 +49,9 @@ class _Task:
     sampler: Sampler | None
 
 
-def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float, *, certify: int = CERTIFIED,
-             clock: Clock | None = None) -> list[Level]:
+def run_jobs(
+    convolver: Convolver, jobs: Sequence[Job], tolerance: float, *, certify: int = CERTIFIED, clock: Clock | None = None
+) -> list[Level]:
     """Make, certify and where needed refine every level, in the order of `jobs`.
 
     The exact values come first, because the cuts that they need are the cuts that the grids need.
@@ -66,11 +68,15 @@ def run_jobs(convolver: Convolver, jobs: Sequence[Job], tolerance: float, *, cer
         references = references_of(convolver, jobs, tolerance, certify) if certify else []
     planned = [one.job for one in references] or list(jobs)
     with clock("source"):
-        sampler = Sampler(convolver.overlaps, convolver.precision, convolver.progress) \
-            if any(job.plan.samples for job in planned) else None
+        sampler = (
+            Sampler(convolver.overlaps, convolver.precision, convolver.progress)
+            if any(job.plan.samples for job in planned)
+            else None
+        )
         if any(job.plan.grid for job in planned):
-            convolver.prepare(max(job.plan.grid for job in planned),
-                              max(job.plan.cuts for job in planned if job.plan.grid))
+            convolver.prepare(
+                max(job.plan.grid for job in planned), max(job.plan.cuts for job in planned if job.plan.grid)
+            )
             convolver.device.finish()
     common = (time.perf_counter() - begin) / len(planned)
     levels, done, whole = [], 0, sum(map(_work, planned))
@@ -113,10 +119,15 @@ def _finished(convolver: Convolver, task: _Task, tolerance: float, clock: Clock)
         finer = planning.refined(job.plan, missed, job.lobe.horizon) if job.lobe else None
         stuck = stuck + 1 if not level.error <= 0.9 * before else 0
         if finer is None or stuck == 2:
-            name = "mean" if job.lobe is None else " of ".join([job.lobe.name, *(
-                entry.name for entry, *_ in job.lobe.summands[:1])])
-            raise CheckError(f"level {name} of {'×'.join(map(str, job.shape.dims))} texels has an error of "
-                             f"{level.error:.2g}, over the tolerance {tolerance:g}, and finer grids do not help")
+            name = (
+                "mean"
+                if job.lobe is None
+                else " of ".join([job.lobe.name, *(entry.name for entry, *_ in job.lobe.summands[:1])])
+            )
+            raise CheckError(
+                f"level {name} of {'×'.join(map(str, job.shape.dims))} texels has an error of "
+                f"{level.error:.2g}, over the tolerance {tolerance:g}, and finer grids do not help"
+            )
         job, before = replace(job, plan=finer), level.error
 
 
@@ -135,8 +146,14 @@ def _texels(convolver: Convolver, job: Job, tolerance: float, task: _Task) -> np
 def _certified(convolver: Convolver, job: Job, texels: np.ndarray, reference: Reference) -> Level:
     """The level with the errors of its texels against the reference."""
     index, mean = reference.index, job.shape.mean(texels)
-    error, worst, rmse = statement(texels.reshape(-1, 3)[index], reference.values, reference.sample,
-                                   job.shape.solid_angles(index), mean, job.shape.count)
+    error, worst, rmse = statement(
+        texels.reshape(-1, 3)[index],
+        reference.values,
+        reference.sample,
+        job.shape.solid_angles(index),
+        mean,
+        job.shape.count,
+    )
     # A mean over texels is computed and checked in float64 and rounded once; other levels have a larger rounding error.
     rounding = 0.0 if mean == 0 else ROUNDING[64 if job.lobe is None else convolver.precision]
     if mean > 0 and not convolver.constant:

@@ -1,5 +1,6 @@
 """Prefilters the light of an environment: the specular chain, irradiance and spherical harmonics, with certified
 errors."""
+
 from __future__ import annotations
 
 import time
@@ -127,8 +128,9 @@ class Lighting:
     seconds: float
 
 
-def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str = "",
-          progress: Progress | None = None) -> Lighting:
+def light(
+    device: Device, env: Environment, wants: Sequence[Want], *, seed: str = "", progress: Progress | None = None
+) -> Lighting:
     """Prefilter an environment for several chains, which share grids, certificates and equal levels.
 
     wants: the chains; the tolerance of the first holds for irradiance too. seed: of the certificates' samples.
@@ -138,14 +140,15 @@ def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str 
     """
     begin = time.perf_counter()
     recipe = wants[0].recipe
-    convolver = Convolver(device, env, precision=planning.precision_for(recipe.tolerance), seed=seed,
-                          progress=progress)
+    convolver = Convolver(device, env, precision=planning.precision_for(recipe.tolerance), seed=seed, progress=progress)
     jobs, places, tolerances = _distinct(convolver, wants)
     everything = [*jobs, irradiance_job(convolver, IRRADIANCE_SIZE, recipe.tolerance, recipe.samples)]
     levels = _run(convolver, everything, [*tolerances, recipe.tolerance], recipe.certify)
     sh, sh_error = convolver.harmonics()
-    kept = [job.shape.mean(level.texels) / convolver.mean - 1 if convolver.mean > 0 else 0.0
-            for job, level in zip(jobs, levels[:-1], strict=True)]
+    kept = [
+        job.shape.mean(level.texels) / convolver.mean - 1 if convolver.mean > 0 else 0.0
+        for job, level in zip(jobs, levels[:-1], strict=True)
+    ]
     coverage: list[Level] = []
     if env.coverage is not None:
         # Coverage is filtered and certified as light of one channel.
@@ -158,9 +161,17 @@ def light(device: Device, env: Environment, wants: Sequence[Want], *, seed: str 
     chains = []
     for cubes, wide, square in places:
         covered = [tuple(coverage[k] for k in some) if coverage else () for some in (cubes, wide, square)]
-        chains.append(Filtered(tuple(levels[k] for k in cubes), tuple(levels[k] for k in wide),
-                               tuple(kept[k] for k in cubes), covered[0], covered[1],
-                               tuple(levels[k] for k in square), covered[2]))
+        chains.append(
+            Filtered(
+                tuple(levels[k] for k in cubes),
+                tuple(levels[k] for k in wide),
+                tuple(kept[k] for k in cubes),
+                covered[0],
+                covered[1],
+                tuple(levels[k] for k in square),
+                covered[2],
+            )
+        )
     return Lighting(tuple(chains), levels[-1], sh, sh_error, time.perf_counter() - begin)
 
 
@@ -173,8 +184,9 @@ def _run(convolver: Convolver, jobs: Sequence[Job], tolerances: Sequence[float],
     return [made[k] for k in range(len(jobs))]
 
 
-def _distinct(convolver: Convolver, wants: Sequence[Want]
-              ) -> tuple[list[Job], list[tuple[list[int], ...]], list[float]]:
+def _distinct(
+    convolver: Convolver, wants: Sequence[Want]
+) -> tuple[list[Job], list[tuple[list[int], ...]], list[float]]:
     """The distinct jobs of all chains; for each chain the indices of its cubes, lat-longs and octahedral maps; and the
     tolerance of each job, the smallest of the chains that need it."""
     jobs: list[Job] = []
@@ -199,11 +211,24 @@ def _distinct(convolver: Convolver, wants: Sequence[Want]
     return jobs, places, tolerances
 
 
-def prefilter(source: Any, *, size: int = 256, min_size: int | None = None, ndf: str | Model = "ggx",
-              tolerance: float | None = None, quality: str | None = None, samples: int | None = None,
-              levels: int | None = None, fit: str | None = None, certify: int = CERTIFIED, rotate: float = 0.0,
-              exposure: float = 0.0, nonfinite: str = "refuse", latlong: bool = False,
-              device: Device | str | None = None) -> Prefiltered:
+def prefilter(
+    source: Any,
+    *,
+    size: int = 256,
+    min_size: int | None = None,
+    ndf: str | Model = "ggx",
+    tolerance: float | None = None,
+    quality: str | None = None,
+    samples: int | None = None,
+    levels: int | None = None,
+    fit: str | None = None,
+    certify: int = CERTIFIED,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: str = "refuse",
+    latlong: bool = False,
+    device: Device | str | None = None,
+) -> Prefiltered:
     """Prefilter the specular chain of an environment.
 
     source: a path, an array or an `Environment`. size, min_size: texels a face edge of the first and the last level,
@@ -218,20 +243,38 @@ def prefilter(source: Any, *, size: int = 256, min_size: int | None = None, ndf:
     Raises the errors of `environment`, UsageError, UnsupportedError, CheckError, DeviceError.
     """
     begin = time.perf_counter()
-    recipe = chain(ndf=ndf, size=size, min_size=min_size, tolerance=tolerance, quality=quality, samples=samples,
-                   levels=levels, fit=fit, certify=certify)
+    recipe = chain(
+        ndf=ndf,
+        size=size,
+        min_size=min_size,
+        tolerance=tolerance,
+        quality=quality,
+        samples=samples,
+        levels=levels,
+        fit=fit,
+        certify=certify,
+    )
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     clock = Clock()
     with clock("source"):
         convolver = Convolver(_device(device), env, precision=planning.precision_for(recipe.tolerance))
-    made = run_jobs(convolver, chain_jobs(convolver, recipe, latlong=latlong), recipe.tolerance, certify=recipe.certify,
-                    clock=clock)
+    made = run_jobs(
+        convolver, chain_jobs(convolver, recipe, latlong=latlong), recipe.tolerance, certify=recipe.certify, clock=clock
+    )
     return Prefiltered(tuple(made), time.perf_counter() - begin, clock.seconds)
 
 
-def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | None = None,
-               samples: int | None = None, rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse",
-               device: Device | str | None = None) -> Certified:
+def irradiance(
+    source: Any,
+    *,
+    size: int = IRRADIANCE_SIZE,
+    tolerance: float | None = None,
+    samples: int | None = None,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: str = "refuse",
+    device: Device | str | None = None,
+) -> Certified:
     """The irradiance of an environment over π, as a cube (6, size, size, 3) float32.
 
     A constant environment of 1 gives 1. size: texels a face edge, 1 to 1024. The other parameters and the errors
@@ -245,12 +288,25 @@ def irradiance(source: Any, *, size: int = IRRADIANCE_SIZE, tolerance: float | N
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     convolver = Convolver(_device(device), env, precision=planning.precision_for(bound))
     level = run_jobs(convolver, [irradiance_job(convolver, size, bound, count)], bound)[0]
-    return Certified(level.texels, level.error, level.pairs, time.perf_counter() - begin, level.method,
-                     worst=level.worst, rmse=level.rmse)
+    return Certified(
+        level.texels,
+        level.error,
+        level.pairs,
+        time.perf_counter() - begin,
+        level.method,
+        worst=level.worst,
+        rmse=level.rmse,
+    )
 
 
-def harmonics(source: Any, *, rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse",
-              device: Device | str | None = None) -> Certified:
+def harmonics(
+    source: Any,
+    *,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: str = "refuse",
+    device: Device | str | None = None,
+) -> Certified:
     """Spherical harmonics of an environment's radiance to degree 2, (9, 3) float64.
 
     The basis is real and orthonormal in world x, y, z, without the Condon-Shortley sign, in the order L00, L1-1, L10,
@@ -260,8 +316,9 @@ def harmonics(source: Any, *, rotate: float = 0.0, exposure: float = 0.0, nonfin
     env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     convolver = Convolver(_device(device), env)
     values, error = convolver.harmonics()
-    return Certified(values, error, env.texels.size // 3,
-                     time.perf_counter() - begin, "texel-nodes", worst=error, rmse=error)
+    return Certified(
+        values, error, env.texels.size // 3, time.perf_counter() - begin, "texel-nodes", worst=error, rmse=error
+    )
 
 
 def _device(device: Device | str | None) -> Device:

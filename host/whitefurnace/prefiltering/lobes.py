@@ -1,4 +1,5 @@
 """Defines the lobes that environments are convolved with, and fits to each the short series that kernels evaluate."""
+
 from __future__ import annotations
 
 import math
@@ -150,21 +151,31 @@ def ndf_lobe(device: Device, choice: Chosen, roughness: float, parameters: Mappi
     norm = lobe_norm(device, entry, parameters)
     # The slope of K/∫K at the horizon is α²/π for GGX. A lobe that lies there entirely (sheen) has the width 1/horizon.
     horizon = math.sqrt(math.pi * at_horizon(device, entry, parameters) / norm)
-    return Lobe(f"r = {roughness:.3f}", ((entry, numbers, 1.0),), norm,
-                min(max(roughness * roughness, 1e-5), 1 / max(horizon, 1.0)), max(horizon, 1e-5),
-                lambda q: density_at(device, entry, parameters, q))
+    return Lobe(
+        f"r = {roughness:.3f}",
+        ((entry, numbers, 1.0),),
+        norm,
+        min(max(roughness * roughness, 1e-5), 1 / max(horizon, 1.0)),
+        max(horizon, 1e-5),
+        lambda q: density_at(device, entry, parameters, q),
+    )
 
 
-def mixture_lobe(device: Device, choice: Chosen, parts: Sequence[tuple[float, float]],
-                 parameters: Callable[[float], Mapping[str, Any]]) -> Lobe:
+def mixture_lobe(
+    device: Device,
+    choice: Chosen,
+    parts: Sequence[tuple[float, float]],
+    parameters: Callable[[float], Mapping[str, Any]],
+) -> Lobe:
     """The weighted sum of an NDF's normalized lobes at several roughness values, a lobe of norm 1.
 
     parts: (weight, perceptual roughness) of each; the weights sum to 1. parameters: gives the NDF's parameters at a
     roughness. Raises InputError for a user's NDF that cannot be normalized.
     """
     lobes = [(weight, ndf_lobe(device, choice, r, parameters(r))) for weight, r in parts if weight != 0]
-    summands = tuple((entry, numbers, weight / lobe.norm) for weight, lobe in lobes
-                     for entry, numbers, _ in lobe.summands)
+    summands = tuple(
+        (entry, numbers, weight / lobe.norm) for weight, lobe in lobes for entry, numbers, _ in lobe.summands
+    )
     name = f"r = {sum(weight * r for weight, r in parts):.3f} fitted"
 
     def density(q: np.ndarray) -> np.ndarray:
@@ -181,5 +192,3 @@ def _one(q: np.ndarray) -> np.ndarray:
 
 
 COSINE = Lobe("irradiance", (), math.pi, 1.0, 1.0, _one)
-
-

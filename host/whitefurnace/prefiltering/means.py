@@ -1,5 +1,6 @@
 """Computes the mean of a source over each texel of a cube or a lat-long (level 0) by exact areas of overlap. Data that
 depend on the two grids alone are made once and kept for every image of the same size."""
+
 from __future__ import annotations
 
 import itertools
@@ -74,8 +75,9 @@ class Means:
             return self.texels.copy()
         if not self.device.fp64:
             # Float32 places edges to 1e-5 of a texel, too coarse for a sliver of sun, so the host computes in float64.
-            parts = [self.exact(shape, part)
-                     for part in np.array_split(np.arange(shape.count), -(-shape.count // 4096))]
+            parts = [
+                self.exact(shape, part) for part in np.array_split(np.arange(shape.count), -(-shape.count // 4096))
+            ]
             return np.concatenate(parts).astype(np.float32).reshape(*shape.dims, 3)
         if not self.latlong:
             return self._from_cube(shape)
@@ -86,8 +88,12 @@ class Means:
         return mean_over_texels(self.texels, self.rotation, shape.latlong, shape.size, index)
 
     def _same_texels(self, shape: Shape) -> bool:
-        return (shape.latlong == self.latlong and self.rows == shape.size and self.rotation == 0
-                and (not self.latlong or self.columns == 2 * self.rows))
+        return (
+            shape.latlong == self.latlong
+            and self.rows == shape.size
+            and self.rotation == 0
+            and (not self.latlong or self.columns == 2 * self.rows)
+        )
 
     def _run(self, program: Program, name: str, count: int, args: Sequence[Any]) -> None:
         _run(self.device, program, name, count, args)
@@ -97,26 +103,60 @@ class Means:
         level = self.device.empty((6, size, size, 3), np.float32)
         for batch in _batches(self.device, self.rows, self.columns, self.rotation, size):
             lists = batch.lists or _lists(self.device, self.rows, self.columns, self.rotation, size, batch)
-            self._run(program, "mean_by_list", batch.count,
-                      (level, np.int32(batch.first), np.int32(batch.count), np.int32(size), np.int32(self.rows),
-                       np.int32(self.columns), batch.start, *lists, self.radiance))
+            self._run(
+                program,
+                "mean_by_list",
+                batch.count,
+                (
+                    level,
+                    np.int32(batch.first),
+                    np.int32(batch.count),
+                    np.int32(size),
+                    np.int32(self.rows),
+                    np.int32(self.columns),
+                    batch.start,
+                    *lists,
+                    self.radiance,
+                ),
+            )
         return level.read()
 
     def _latlong(self, shape: Shape) -> np.ndarray:
         level = self.device.empty((*shape.dims, 3), np.float32)
-        self._run(_program(self.device), "mean_latlong", shape.count,
-                  (level, np.int32(shape.size), np.int32(2 * shape.size), np.int32(self.rows), np.int32(self.columns),
-                   np.float64(self.rotation), self.device.array(row_edges(self.rows, np.float64)),
-                   self.device.array(row_edges(shape.size, np.float64)), self.radiance))
+        self._run(
+            _program(self.device),
+            "mean_latlong",
+            shape.count,
+            (
+                level,
+                np.int32(shape.size),
+                np.int32(2 * shape.size),
+                np.int32(self.rows),
+                np.int32(self.columns),
+                np.float64(self.rotation),
+                self.device.array(row_edges(self.rows, np.float64)),
+                self.device.array(row_edges(shape.size, np.float64)),
+                self.radiance,
+            ),
+        )
         return level.read()
 
     def _from_cube(self, shape: Shape) -> np.ndarray:
         if self.rotation == 0 and not shape.latlong:
             level = self.device.empty((*shape.dims, 3), np.float32)
             make = _kept_pieces if max(shape.size, self.rows) <= PIECES else _pieces
-            self._run(_program(self.device), "mean_aligned", shape.size**2,
-                      (level, np.int32(shape.size), np.int32(self.rows), *make(self.device, self.rows, shape.size),
-                       self.radiance))
+            self._run(
+                _program(self.device),
+                "mean_aligned",
+                shape.size**2,
+                (
+                    level,
+                    np.int32(shape.size),
+                    np.int32(self.rows),
+                    *make(self.device, self.rows, shape.size),
+                    self.radiance,
+                ),
+            )
             return level.read()
         # The sagitta of a parallel's chord is at most 2e-6 of the texel's height, (Δφ/chords)²/8 : Δθ; 48 chords do.
         chords = min(48, max(2, math.ceil(math.sqrt(math.pi / shape.size / 8 / 2e-6))))
@@ -124,11 +164,24 @@ class Means:
         for first in range(0, shape.count, TILE):
             count = min(TILE, shape.count - first)
             part = self.device.empty((count, 3), np.float32)
-            self._run(_program(self.device), "mean_cube", count,
-                      (part, np.int32(first), np.int32(count), np.int32(shape.size), np.int32(shape.latlong),
-                       np.int32(chords), np.int32(self.rows), np.float64(math.cos(self.rotation)),
-                       np.float64(math.sin(self.rotation)), self.radiance))
-            out[first:first + count] = part.read()
+            self._run(
+                _program(self.device),
+                "mean_cube",
+                count,
+                (
+                    part,
+                    np.int32(first),
+                    np.int32(count),
+                    np.int32(shape.size),
+                    np.int32(shape.latlong),
+                    np.int32(chords),
+                    np.int32(self.rows),
+                    np.float64(math.cos(self.rotation)),
+                    np.float64(math.sin(self.rotation)),
+                    self.radiance,
+                ),
+            )
+            out[first : first + count] = part.read()
         return out.reshape(*shape.dims, 3)
 
 
@@ -149,8 +202,12 @@ def _pieces(device: Device, n: int, size: int) -> tuple[np.int32, Buffer, Buffer
     corner = np.arctan(x[:, None] * x / np.sqrt(1 + x[:, None] ** 2 + x * x))
     area = np.diff(np.diff(corner, axis=0), axis=1)
     first = np.searchsorted(edges, np.arange(size + 1) * n).astype(np.int32)
-    return (np.int32(len(edges) - 1), device.array(first), device.array((edges[:-1] // size).astype(np.int32)),
-            device.array(area))
+    return (
+        np.int32(len(edges) - 1),
+        device.array(first),
+        device.array((edges[:-1] // size).astype(np.int32)),
+        device.array(area),
+    )
 
 
 _kept_pieces = lru_cache(maxsize=LISTS)(_pieces)
@@ -174,15 +231,20 @@ def _batches(device: Device, rows: int, columns: int, rotation: float, size: int
     turns = _turns(columns)
     total = _generators(size, turns)
     counts = device.empty((total,), np.int32)
-    _run(device, _program(device, turns), "overlap_list", total,
-         (np.int32(0), counts, np.int32(0), *_grids(device, rows, columns, rotation, size, total), None, None, None))
+    _run(
+        device,
+        _program(device, turns),
+        "overlap_list",
+        total,
+        (np.int32(0), counts, np.int32(0), *_grids(device, rows, columns, rotation, size, total), None, None, None),
+    )
     ends = np.concatenate([[0], np.cumsum(counts.read(), dtype=np.int64)])
     cuts = [0]
     while cuts[-1] < total:
         cuts.append(max(int(np.searchsorted(ends, ends[cuts[-1]] + OVERLAPS, "right")) - 1, cuts[-1] + 1))
     batches = []
     for first, last in itertools.pairwise(cuts):
-        start = device.array((ends[first:last + 1] - ends[first]).astype(np.int32))
+        start = device.array((ends[first : last + 1] - ends[first]).astype(np.int32))
         batch = _Batch(first, last - first, start, None)
         if len(cuts) == 2:
             batch = _Batch(first, last - first, start, _lists(device, rows, columns, rotation, size, batch))
@@ -190,14 +252,25 @@ def _batches(device: Device, rows: int, columns: int, rotation: float, size: int
     return tuple(batches)
 
 
-def _lists(device: Device, rows: int, columns: int, rotation: float, size: int,
-           batch: _Batch) -> tuple[Buffer, Buffer]:
+def _lists(device: Device, rows: int, columns: int, rotation: float, size: int, batch: _Batch) -> tuple[Buffer, Buffer]:
     """The (row, column) of the source texels that each generator of a batch overlaps, and their shares of it."""
     length = int(batch.start.read()[-1])
     where, weight = device.empty((length, 2), np.int32), device.empty((length,), np.float64)
-    _run(device, _program(device, _turns(columns)), "overlap_list", batch.count,
-         (np.int32(1), None, np.int32(batch.first), *_grids(device, rows, columns, rotation, size, batch.count),
-          batch.start, where, weight))
+    _run(
+        device,
+        _program(device, _turns(columns)),
+        "overlap_list",
+        batch.count,
+        (
+            np.int32(1),
+            None,
+            np.int32(batch.first),
+            *_grids(device, rows, columns, rotation, size, batch.count),
+            batch.start,
+            where,
+            weight,
+        ),
+    )
     return where, weight
 
 
@@ -208,5 +281,11 @@ def _grids(device: Device, rows: int, columns: int, rotation: float, size: int, 
     if rows % 2 == 0:
         cotangent[rows // 2] = 0.0
     edges = np.stack([2 * np.sin(theta / 2) ** 2, cotangent], 1)
-    return (np.int32(count), np.int32(size), np.int32(rows), np.int32(columns), np.float64(rotation),
-            device.array(edges))
+    return (
+        np.int32(count),
+        np.int32(size),
+        np.int32(rows),
+        np.int32(columns),
+        np.float64(rotation),
+        device.array(edges),
+    )

@@ -1,4 +1,5 @@
 """Plans the work of a specular chain: source grids, texel cuts, precision and launch sizes that a tolerance needs."""
+
 from __future__ import annotations
 
 import math
@@ -111,8 +112,10 @@ def grid_size(alpha: float, tolerance: float, horizon: float | None = None) -> i
     horizon: the α at which GGX's kink at the horizon is as strong as the lobe's; by default α itself.
     """
     finer = (1e-3 / tolerance) ** (1 / RATE)
-    n = max((SHARP / max(alpha, 1e-9) + MARGIN) * finer,
-            FLOOR * finer + KINK * kink(alpha if horizon is None else horizon) * finer ** (RATE / 2))
+    n = max(
+        (SHARP / max(alpha, 1e-9) + MARGIN) * finer,
+        FLOOR * finer + KINK * kink(alpha if horizon is None else horizon) * finer ** (RATE / 2),
+    )
     return min(nodes_for(n), LARGEST_GRID)
 
 
@@ -248,6 +251,7 @@ FAR_NODES = 20.0
 """Nodes × radians of a far grid beyond the angle where the near part ends, for a tolerance of 1e-3. Measured: it leaves
 the error as it is."""
 
+
 @lru_cache(maxsize=4096)
 def parts_for(n: int, alpha: float, horizon: float | None = None) -> tuple[Part, ...]:
     """The cheapest partition found of a lobe whose fine grid has n × n nodes a face.
@@ -284,8 +288,9 @@ def parts_for(n: int, alpha: float, horizon: float | None = None) -> tuple[Part,
     chosen = best[1]
     windows = [Window(q1(theta) / 16, q1(theta)) for theta in chosen]
     grids = [n, *(far(theta) for theta in chosen)]
-    return tuple(Part(grid, inner, outer) for grid, inner, outer
-                 in zip(grids, [None, *windows], [*windows, None], strict=True))
+    return tuple(
+        Part(grid, inner, outer) for grid, inner, outer in zip(grids, [None, *windows], [*windows, None], strict=True)
+    )
 
 
 def plan_chain(chain: Chain, texel: float, share: float = 0.0, centred: int = 1) -> tuple[LevelPlan, ...]:
@@ -299,8 +304,16 @@ def plan_chain(chain: Chain, texel: float, share: float = 0.0, centred: int = 1)
         parameters = chain.parameters(r)
         alpha = max(r * r, 1e-5)
         samples = 0 if r == 0 else chain.samples or 0
-        levels.append(LevelPlan(size, r, parameters, 0 if r == 0 or samples else grid_size(alpha, chain.tolerance),
-                                1 if r == 0 else cuts_for(texel, alpha, chain.tolerance, share, centred), samples))
+        levels.append(
+            LevelPlan(
+                size,
+                r,
+                parameters,
+                0 if r == 0 or samples else grid_size(alpha, chain.tolerance),
+                1 if r == 0 else cuts_for(texel, alpha, chain.tolerance, share, centred),
+                samples,
+            )
+        )
     return tuple(levels)
 
 

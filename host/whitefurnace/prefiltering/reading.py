@@ -4,6 +4,7 @@ The levels of a bake are exact to their tolerance, but an engine shows them with
 reads at lod(r), bilinearly in two cube levels and linearly between them. `Reader.as_read` compares the result with the
 exact lobe of r in the same direction, and splits the error into parts.
 """
+
 from __future__ import annotations
 
 import math
@@ -59,8 +60,7 @@ FORMATS: Mapping[str, str] = {"float32": "rgba32f", "float16": "rgba16f", "r11g1
 
 
 def stored(values: np.ndarray, format: str) -> np.ndarray:
-    """Radiance (…, 3) after a round trip through a format of FORMATS, float64. Raises UsageError with the nearest name.
-    """
+    """Radiance (…, 3) after a round trip through a format of FORMATS, float64. Raises UsageError with the nearest name."""
     if format not in FORMATS:
         raise UsageError(f"unknown format {format!r}{nearest(format, FORMATS)}")
     values = np.asarray(values, np.float64)
@@ -158,9 +158,11 @@ class Exact:
         if mixture not in self._lobes:
             choice, parameters = self.recipe.ndf, self.recipe.parameters
             roughness = mixture[0][1]
-            self._lobes[mixture] = (ndf_lobe(self.device, choice, roughness, parameters(roughness))
-                                    if mixture == single(roughness) else
-                                    mixture_lobe(self.device, choice, mixture, parameters))
+            self._lobes[mixture] = (
+                ndf_lobe(self.device, choice, roughness, parameters(roughness))
+                if mixture == single(roughness)
+                else mixture_lobe(self.device, choice, mixture, parameters)
+            )
         return self._lobes[mixture]
 
     def convolver(self, k: int, precision: int = 32) -> Convolver:
@@ -192,8 +194,9 @@ class Exact:
             for precision in (32, 64):
                 convolver = self.convolver(k, precision)
                 with np.errstate(invalid="ignore"):
-                    found = convolver.exact([(self._lobe(wanted[job][0]), wanted[job][1]) for job in jobs], cuts,
-                                            TOLERANCE)
+                    found = convolver.exact(
+                        [(self._lobe(wanted[job][0]), wanted[job][1]) for job in jobs], cuts, TOLERANCE
+                    )
                 for job, value in zip(jobs, found, strict=True):
                     values[job] = value / convolver.scale
                 # Charlie's lobe lies in the last degrees above the horizon, and underflows float32 where it is thin.
@@ -202,8 +205,10 @@ class Exact:
                     break
             else:
                 lobe = self._lobe(wanted[jobs[0]][0]).name
-                raise UnsupportedError(f"ndf {self.recipe.ndf.model.name} at {lobe} has no lobe that "
-                                       f"float{convolver.precision} can integrate")
+                raise UnsupportedError(
+                    f"ndf {self.recipe.ndf.model.name} at {lobe} has no lobe that "
+                    f"float{convolver.precision} can integrate"
+                )
         return values
 
     def radiance(self, d: np.ndarray) -> np.ndarray:
@@ -243,7 +248,7 @@ class Interpolated:
             first = min(max(int(x) - 1, 0), len(self.values) - 4)
             nodes = range(4)
             weights = [math.prod((x - first - b) / (a - b) for b in nodes if b != a) for a in nodes]
-            out.append(np.exp(np.tensordot(weights, self.values[first:first + 4], 1)) - self.floor)
+            out.append(np.exp(np.tensordot(weights, self.values[first : first + 4], 1)) - self.floor)
         return np.stack(out)
 
 
@@ -274,14 +279,24 @@ class AsRead:
 
     def data(self) -> dict[str, Any]:
         """The errors as manifests and JSON rows hold them."""
-        parts = {part: {"mean": float(self.rms[part].mean()), "p95": float(self.p95[part].mean())}
-                 for part in PARTS if part in self.rms}
+        parts = {
+            part: {"mean": float(self.rms[part].mean()), "p95": float(self.p95[part].mean())}
+            for part in PARTS
+            if part in self.rms
+        }
         whole = "all" if "all" in self.rms else "between"
-        return {"levels": len(self.sizes), "sizes": list(self.sizes), "fit": self.fit, "format": self.format,
-                "parts": parts,
-                "over_roughness": {"roughness": [round(float(r), 6) for r in self.roughness],
-                                   "rms": [float(x) for x in self.rms[whole]],
-                                   "p95": [float(x) for x in self.p95[whole]]}}
+        return {
+            "levels": len(self.sizes),
+            "sizes": list(self.sizes),
+            "fit": self.fit,
+            "format": self.format,
+            "parts": parts,
+            "over_roughness": {
+                "roughness": [round(float(r), 6) for r in self.roughness],
+                "rms": [float(x) for x in self.rms[whole]],
+                "p95": [float(x) for x in self.p95[whole]],
+            },
+        }
 
 
 def scored() -> np.ndarray:
@@ -302,8 +317,9 @@ class Reader:
     DeviceError.
     """
 
-    def __init__(self, device: Device, env: Environment, *recipes: Chain, directions: int = DIRECTIONS,
-                 seed: int = 0) -> None:
+    def __init__(
+        self, device: Device, env: Environment, *recipes: Chain, directions: int = DIRECTIONS, seed: int = 0
+    ) -> None:
         self.device = device
         self.exact = Exact(device, env, recipes[0])
         self.d = random_directions(directions, seed)
@@ -318,9 +334,16 @@ class Reader:
             return own
         return [mixture or lobe for mixture, lobe in zip(read_mixtures(self.device, recipe), own, strict=True)]
 
-    def as_read(self, recipe: Chain, levels: Sequence[np.ndarray] | None = None,
-                errors: Sequence[float] | None = None, *, format: str = "float32",
-                kept: Sequence[np.ndarray] | None = None, texels: bool = True) -> AsRead:
+    def as_read(
+        self,
+        recipe: Chain,
+        levels: Sequence[np.ndarray] | None = None,
+        errors: Sequence[float] | None = None,
+        *,
+        format: str = "float32",
+        kept: Sequence[np.ndarray] | None = None,
+        texels: bool = True,
+    ) -> AsRead:
         """The error of a chain as it is read.
 
         levels: its baked levels, (6, s, s, 3) each, with `errors`, their stated errors; without them the levels are
@@ -336,29 +359,47 @@ class Reader:
         parts = {"between": np.tensordot(weights, there, 1) - self.reference}
         if texels:
             tapped = [taps(size, self.d) for size, _ in recipe.levels]
-            made = (self._texels(recipe, mixtures, tapped) if levels is None else
-                    [level.reshape(-1, 3)[index].astype(np.float64)
-                     for level, (index, _) in zip(levels, tapped, strict=True)])
-            held = ([stored(part, format) for part in made] if kept is None else
-                    [level.reshape(-1, 3)[index].astype(np.float64)
-                     for level, (index, _) in zip(kept, tapped, strict=True)])
-            read, shown = (np.stack([np.einsum("km,kmc->mc", w, part)
-                                     for part, (_, w) in zip(some, tapped, strict=True)])
-                           for some in (made, held))
+            made = (
+                self._texels(recipe, mixtures, tapped)
+                if levels is None
+                else [
+                    level.reshape(-1, 3)[index].astype(np.float64)
+                    for level, (index, _) in zip(levels, tapped, strict=True)
+                ]
+            )
+            held = (
+                [stored(part, format) for part in made]
+                if kept is None
+                else [
+                    level.reshape(-1, 3)[index].astype(np.float64)
+                    for level, (index, _) in zip(kept, tapped, strict=True)
+                ]
+            )
+            read, shown = (
+                np.stack([np.einsum("km,kmc->mc", w, part) for part, (_, w) in zip(some, tapped, strict=True)])
+                for some in (made, held)
+            )
             parts["texels"] = np.tensordot(weights, read - there, 1)
             parts["format"] = np.tensordot(weights, shown - read, 1)
             parts["all"] = np.tensordot(weights, shown, 1) - self.reference
-        off = {part: np.stack([texel_errors(ref + more, ref, self.exact.mean)
-                                  for ref, more in zip(self.reference, difference, strict=True)])
-                  for part, difference in parts.items()}
+        off = {
+            part: np.stack(
+                [
+                    texel_errors(ref + more, ref, self.exact.mean)
+                    for ref, more in zip(self.reference, difference, strict=True)
+                ]
+            )
+            for part, difference in parts.items()
+        }
         rms = {part: np.sqrt((e * e).mean(1)) for part, e in off.items()}
         p95 = {part: np.quantile(e, 0.95, axis=1) for part, e in off.items()}
         if errors is not None:
             rms["levels"] = p95["levels"] = weights @ np.asarray(errors, np.float64)
         return AsRead(tuple(size for size, _ in recipe.levels), recipe.fit, format, scored(), rms, p95)
 
-    def _texels(self, recipe: Chain, mixtures: Sequence[Mixture],
-                tapped: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[np.ndarray]:
+    def _texels(
+        self, recipe: Chain, mixtures: Sequence[Mixture], tapped: Sequence[tuple[np.ndarray, np.ndarray]]
+    ) -> list[np.ndarray]:
         """Exact values (4, m, 3) of the texels that each level is read from."""
         wanted, places = [], []
         for (size, roughness), mixture, (index, _) in zip(recipe.levels, mixtures, tapped, strict=True):
@@ -367,8 +408,10 @@ class Reader:
             if roughness > 0:
                 wanted.append((mixture, Shape(False, size).directions(distinct)))
         values = iter(self.exact.lobes(wanted))
-        return [(next(values) if roughness > 0 else self.exact.means(size, distinct))[back]
-                for size, roughness, distinct, back in places]
+        return [
+            (next(values) if roughness > 0 else self.exact.means(size, distinct))[back]
+            for size, roughness, distinct, back in places
+        ]
 
 
 def alternatives(recipe: Chain) -> list[Chain]:

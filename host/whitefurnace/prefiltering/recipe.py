@@ -1,4 +1,5 @@
 """Validates the choice of a specular chain: its model, sizes, roughness values and accuracy."""
+
 from __future__ import annotations
 
 import math
@@ -79,8 +80,7 @@ def roughness_of_lod(lod: float, levels: int) -> float:
 
 
 def lod_of_roughness(roughness: float, levels: int) -> float:
-    """The lod at which engines read a perceptual roughness, the inverse of `roughness_of_lod`: (levels - 1) r (2 - r).
-    """
+    """The lod at which engines read a perceptual roughness, the inverse of `roughness_of_lod`: (levels - 1) r (2 - r)."""
     return (levels - 1) * roughness * (2 - roughness)
 
 
@@ -196,7 +196,7 @@ class Chain:
     @cached_property
     def levels(self) -> tuple[tuple[int, float], ...]:
         """(size, perceptual roughness) of each level that is made."""
-        return self.all_levels if self.only is None else self.all_levels[self.only[0]:self.only[1] + 1]
+        return self.all_levels if self.only is None else self.all_levels[self.only[0] : self.only[1] + 1]
 
     @property
     def first(self) -> int:
@@ -220,10 +220,16 @@ class Chain:
 
     def canonical(self) -> dict[str, Any]:
         """The chain as a JSON object, equal for equal chains, as recipes and keys contain it."""
-        return {"ndf": self.ndf.canonical(), "size": self.size, "min_size": self.min_size,
-                **({"tolerance": self.tolerance} if self.samples is None else {"samples": self.samples}),
-                "roughness": [r for _, r in self.levels], "fit": self.fit, "certify": self.certify,
-                **({"only": list(self.only)} if self.only else {})}
+        return {
+            "ndf": self.ndf.canonical(),
+            "size": self.size,
+            "min_size": self.min_size,
+            **({"tolerance": self.tolerance} if self.samples is None else {"samples": self.samples}),
+            "roughness": [r for _, r in self.levels],
+            "fit": self.fit,
+            "certify": self.certify,
+            **({"only": list(self.only)} if self.only else {}),
+        }
 
 
 def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = MIN_SIZE) -> int:
@@ -236,19 +242,34 @@ def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = 
     halvings = int(math.log2(size)) + 1
     if min_size is None:
         if levels > halvings:
-            raise UsageError(f"levels {levels} is outside [1, {halvings}]: from {size}² each level halves, down to 1²; "
-                             f"with a min-size too, the last levels keep that size")
+            raise UsageError(
+                f"levels {levels} is outside [1, {halvings}]: from {size}² each level halves, down to 1²; "
+                f"with a min-size too, the last levels keep that size"
+            )
         return size >> (levels - 1)
     if min_size <= size and size >> (levels - 1) > min_size:
-        raise UsageError(f"levels {levels} from {size}² end at {size >> (levels - 1)}², not at min-size {min_size}; "
-                         f"give one of the two, or at least {int(math.log2(size // min_size)) + 1} levels")
+        raise UsageError(
+            f"levels {levels} from {size}² end at {size >> (levels - 1)}², not at min-size {min_size}; "
+            f"give one of the two, or at least {int(math.log2(size // min_size)) + 1} levels"
+        )
     return min_size
 
 
-def chain(*, ndf: Spec = "ggx", size: int = 256, min_size: int | None = None, tolerance: float | None = None,
-          quality: str | None = None, levels: int | None = None, fit: str | None = None,
-          samples: int | None = None, certify: int = CERTIFIED, lods: Lods | None = None,
-          usual_min: int = MIN_SIZE, only_levels: str | None = None) -> Chain:
+def chain(
+    *,
+    ndf: Spec = "ggx",
+    size: int = 256,
+    min_size: int | None = None,
+    tolerance: float | None = None,
+    quality: str | None = None,
+    levels: int | None = None,
+    fit: str | None = None,
+    samples: int | None = None,
+    certify: int = CERTIFIED,
+    lods: Lods | None = None,
+    usual_min: int = MIN_SIZE,
+    only_levels: str | None = None,
+) -> Chain:
     """A validated specular chain.
 
     ndf: name, entry or path of an isotropic NDF. size, min_size: face edges of the first and last level in texels,
@@ -274,11 +295,15 @@ def chain(*, ndf: Spec = "ggx", size: int = 256, min_size: int | None = None, to
             raise UsageError(f"ndf {choice.model.name}: {name} follows the roughness of each level and cannot be given")
     if any(isinstance(value, tuple) for value in choice.given.values()):
         raise UsageError(f"ndf {choice.model.name}: a chain takes one number a parameter, not three")
-    missing = [p.name for p in choice.model.parameters
-               if p.name not in rough and p.name not in choice.given and p.default is None]
+    missing = [
+        p.name
+        for p in choice.model.parameters
+        if p.name not in rough and p.name not in choice.given and p.default is None
+    ]
     if missing:
-        raise UsageError(f"ndf {choice.model.name}: {', '.join(missing)} must be given, as "
-                         f"{choice.model.name}:{missing[0]}=VALUE")
+        raise UsageError(
+            f"ndf {choice.model.name}: {', '.join(missing)} must be given, as {choice.model.name}:{missing[0]}=VALUE"
+        )
     if fit is not None and fit not in FITS:
         raise UsageError(f"unknown fit {fit!r}{nearest(fit, FITS)}")
     size = _power_of_two(size, "size")
@@ -289,10 +314,21 @@ def chain(*, ndf: Spec = "ggx", size: int = 256, min_size: int | None = None, to
     count = samples_of(samples, tolerance, quality)
     low, high = CERTIFY_RANGE
     if certify != 0 and not (is_number(certify) and low <= certify <= high and certify == int(certify)):
-        raise UsageError(f"certify {certify!r} is not a whole number in [{low}, {high}]: {low} texels are the fewest "
-                         "that bound 99 % of a level at 95 % confidence")
-    made = Chain(choice, size, smallest, tolerance_of(tolerance, quality), None if levels is None else int(levels), fit,
-                 count, int(certify), lods or Lods())
+        raise UsageError(
+            f"certify {certify!r} is not a whole number in [{low}, {high}]: {low} texels are the fewest "
+            "that bound 99 % of a level at 95 % confidence"
+        )
+    made = Chain(
+        choice,
+        size,
+        smallest,
+        tolerance_of(tolerance, quality),
+        None if levels is None else int(levels),
+        fit,
+        count,
+        int(certify),
+        lods or Lods(),
+    )
     if only_levels is not None:
         found = re.fullmatch(r"\s*(\d{1,3})\s*-\s*(\d{1,3})\s*", only_levels)
         if not found or not int(found[1]) <= int(found[2]) < len(made.levels):
@@ -301,6 +337,7 @@ def chain(*, ndf: Spec = "ggx", size: int = 256, min_size: int | None = None, to
             raise UsageError("give a fit or only-levels, not both: a fit mixes lobes over all levels")
         made = replace(made, only=(int(found[1]), int(found[2])))
     if fit and made.levels[-1][1] > 1:
-        raise UnsupportedError(f"fit {fit!r} goes up to r = 1; the last level of this mapping is at "
-                               f"r = {made.levels[-1][1]:.3g}")
+        raise UnsupportedError(
+            f"fit {fit!r} goes up to r = 1; the last level of this mapping is at r = {made.levels[-1][1]:.3g}"
+        )
     return made

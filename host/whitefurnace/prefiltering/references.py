@@ -1,4 +1,5 @@
 """Computes exact values of the texels that certify a level, as finely as the tolerance needs."""
+
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -67,8 +68,9 @@ def references_of(convolver: Convolver, jobs: Sequence[Job], tolerance: float, c
             n = planning.nodes_for(COARSE["rough" if one.job.kinked else "sharp"] * one.job.plan.grid)
             one.grid = n if n <= COARSE_GRID and 2 * 6 * n * n <= convolver.texels.nodes(one.cuts) else 0
     if any(one.grid for one in found):
-        convolver.prepare(max(max(one.grid, one.job.plan.grid) for one in found),
-                          max(one.cuts for one in found if one.job.lobe))
+        convolver.prepare(
+            max(max(one.grid, one.job.plan.grid) for one in found), max(one.cuts for one in found if one.job.lobe)
+        )
     todo = [one for one in found if one.job.lobe]
     while todo:
         _integrate(convolver, todo, tolerance)
@@ -84,8 +86,9 @@ def _integrate(convolver: Convolver, todo: Sequence[Reference], tolerance: float
             one.values = convolver.on_grid(one.job.own_lobe, one.job.shape.directions(one.index), one.grid, tolerance)
     for cuts in sorted({one.cuts for one in todo if not one.grid}):
         group = [one for one in todo if not one.grid and one.cuts == cuts]
-        for one, values in zip(group, _exact(convolver, group, [one.index for one in group], cuts, tolerance),
-                               strict=True):
+        for one, values in zip(
+            group, _exact(convolver, group, [one.index for one in group], cuts, tolerance), strict=True
+        ):
             one.values = values
             one.doubt = planning.cuts_error(convolver.texel, one.job.own_lobe.alpha, cuts, convolver.texels.centred)
 
@@ -99,8 +102,13 @@ def _doubted(convolver: Convolver, todo: Sequence[Reference], tolerance: float) 
     again = []
     for cuts, group in sorted(by_cuts.items()):
         dark = [np.argsort(one.values.min(1), kind="stable")[:PROBES] for one, _ in group]
-        finer = _exact(convolver, [one for one, _ in group],
-                       [one.index[probes] for (one, _), probes in zip(group, dark, strict=True)], cuts, tolerance)
+        finer = _exact(
+            convolver,
+            [one for one, _ in group],
+            [one.index[probes] for (one, _), probes in zip(group, dark, strict=True)],
+            cuts,
+            tolerance,
+        )
         # On small images more nodes cost nothing: there the reference is made exact, not just good enough.
         cheap = convolver.texels.nodes(cuts) <= planning.NODES_A_BAND
         for (one, detected), probes, values in zip(group, dark, finer, strict=True):
@@ -130,8 +138,12 @@ def _detected(convolver: Convolver, one: Reference) -> float:
     return 1 - ratio**2 if ratio**2 <= 0.55 else 0.0
 
 
-def _exact(convolver: Convolver, group: Sequence[Reference], indices: Sequence[np.ndarray], cuts: int,
-           tolerance: float) -> list[np.ndarray]:
+def _exact(
+    convolver: Convolver, group: Sequence[Reference], indices: Sequence[np.ndarray], cuts: int, tolerance: float
+) -> list[np.ndarray]:
     """Exact values of each level's texels `indices`, in one pass over the source."""
-    return convolver.exact([(one.job.own_lobe, one.job.shape.directions(index))
-                            for one, index in zip(group, indices, strict=True)], cuts, tolerance)
+    return convolver.exact(
+        [(one.job.own_lobe, one.job.shape.directions(index)) for one, index in zip(group, indices, strict=True)],
+        cuts,
+        tolerance,
+    )

@@ -1,5 +1,6 @@
 """Represents one environment on a device: its brightest texels apart, the rest as lists of nodes and as anterpolated
 grids."""
+
 from __future__ import annotations
 
 import math
@@ -133,14 +134,36 @@ class Texels:
             parts = self._clipped
             if cuts > 1:
                 parts = out
-                self.launch("cut_texels", self.faces * rows,
-                            (parts, self._clipped, np.int32(columns), np.int32(self.faces * rows), np.int32(cuts)))
-            self.launch("correct_rows", self.faces * rows,
-                        (half, parts, np.int32(rows), np.int32(columns * 3), self.device.array(fix.row_tap),
-                         self.device.array(fix.row_factor)))
-            self.launch("correct_columns", self.faces * rows,
-                        (out, half, np.int32(rows), np.int32(columns), self.device.array(fix.column_tap),
-                         self.device.array(fix.column_factor), *(np.float32(f) for f in fix.inner)))
+                self.launch(
+                    "cut_texels",
+                    self.faces * rows,
+                    (parts, self._clipped, np.int32(columns), np.int32(self.faces * rows), np.int32(cuts)),
+                )
+            self.launch(
+                "correct_rows",
+                self.faces * rows,
+                (
+                    half,
+                    parts,
+                    np.int32(rows),
+                    np.int32(columns * 3),
+                    self.device.array(fix.row_tap),
+                    self.device.array(fix.row_factor),
+                ),
+            )
+            self.launch(
+                "correct_columns",
+                self.faces * rows,
+                (
+                    out,
+                    half,
+                    np.int32(rows),
+                    np.int32(columns),
+                    self.device.array(fix.column_tap),
+                    self.device.array(fix.column_factor),
+                    *(np.float32(f) for f in fix.inner),
+                ),
+            )
             self._corrected[cuts] = out
         return self._corrected[cuts]
 
@@ -154,13 +177,20 @@ class Texels:
         rows, columns = self._table(cuts, centred)
         size = (self.rows * cuts, self.columns * cuts, 1) if centred else (self.rows, self.columns, cuts)
         turn = self.environment.rotation
-        return (*(np.int32(k) for k in size), self.real(math.cos(turn)), self.real(math.sin(turn)), rows, columns,
-                self._centres(cuts) if centred else self._clipped)
+        return (
+            *(np.int32(k) for k in size),
+            self.real(math.cos(turn)),
+            self.real(math.sin(turn)),
+            rows,
+            columns,
+            self._centres(cuts) if centred else self._clipped,
+        )
 
     def kernel(self, name: str) -> Kernel:
         """A kernel of the texels' program."""
-        return self.device.build(self._program.text, {"W": self.device.lanes(self.precision), "T": 1,
-                                                      "PRECISION": self.precision}).kernel(name)
+        return self.device.build(
+            self._program.text, {"W": self.device.lanes(self.precision), "T": 1, "PRECISION": self.precision}
+        ).kernel(name)
 
     def launch(self, name: str, count: int, args: Sequence[Any], times: int = 1) -> None:
         """A kernel of the texels' program over at least `count` work items, `times` of them along a second axis."""
@@ -197,11 +227,18 @@ class Texels:
             for cuts in np.unique(wanted):
                 group = np.flatnonzero(wanted == cuts)
                 count = len(group) * int(cuts) ** 2
-                self.launch("chosen_nodes", count,
-                            (listed, np.int32(first), np.int32(len(group)),
-                             self.device.array(self._index[group].astype(np.int32)),
-                             self.device.array(self._excess[group].astype(self.kind)),
-                             *self.arguments(int(cuts), whole=False)))
+                self.launch(
+                    "chosen_nodes",
+                    count,
+                    (
+                        listed,
+                        np.int32(first),
+                        np.int32(len(group)),
+                        self.device.array(self._index[group].astype(np.int32)),
+                        self.device.array(self._excess[group].astype(self.kind)),
+                        *self.arguments(int(cuts), whole=False),
+                    ),
+                )
                 first += count
             self._bright_cache[key] = listed
         return self._bright_cache[key]
@@ -230,8 +267,9 @@ class Texels:
             faces = next(f for f in (6, 3, 2, 1) if f == 1 or f * blocks**2 * reached <= PATCHES)
             patches = self.device.empty((faces, blocks**2, reached), self.kind)
             for face in range(0, 6, faces):
-                self.launch("anterpolate", blocks**2, (patches, np.int32(n), np.int32(face), *self.arguments(cuts)),
-                            faces)
+                self.launch(
+                    "anterpolate", blocks**2, (patches, np.int32(n), np.int32(face), *self.arguments(cuts)), faces
+                )
                 self.launch("gather", n * n, (grid, np.int32(n), np.int32(face), patches), faces)
             self._fine = n, self.cuts, grid
             self._grids = {n: grid}
@@ -245,19 +283,22 @@ class Texels:
             matrix, first, last = (self.device.array(a) for a in coarsening(fine, n, self.kind.char))
             sizes = (np.int32(fine), np.int32(n))
             half = self.device.empty((6, fine, n, 4), self.kind)
-            self.launch("coarsen", 6 * fine * n,
-                        (half, grid, matrix, first, last, *sizes, np.int32(1), np.int32(6 * fine)))
+            self.launch(
+                "coarsen", 6 * fine * n, (half, grid, matrix, first, last, *sizes, np.int32(1), np.int32(6 * fine))
+            )
             coarse = self.device.empty((6, n, n, 4), self.kind)
-            self.launch("coarsen", 6 * n * n,
-                        (coarse, half, matrix, first, last, *sizes, np.int32(n), np.int32(6 * n)))
+            self.launch("coarsen", 6 * n * n, (coarse, half, matrix, first, last, *sizes, np.int32(n), np.int32(6 * n)))
             self._grids[n] = coarse
         return self._grids[n]
 
     def grid_list(self, n: int) -> Buffer:
         """The n × n grid as a list of nodes."""
         listed = self.device.empty((6 * n * n, 8), self.kind)
-        self.launch("grid_list", 6 * n * n, (listed, np.int32(n), self.device.array(grid_tangents(n).astype(self.kind)),
-                                             self.grid(n)))
+        self.launch(
+            "grid_list",
+            6 * n * n,
+            (listed, np.int32(n), self.device.array(grid_tangents(n).astype(self.kind)), self.grid(n)),
+        )
         return listed
 
 
@@ -273,12 +314,13 @@ def _enough(values: np.ndarray, index: np.ndarray, total: float) -> np.ndarray:
     for count in planning.BRIGHT:
         if count <= len(index) and count * float(values[index[count - 1]]) <= planning.LEFT_BRIGHT * total:
             return index[:count]
-    return index[:planning.BRIGHT[0]]
+    return index[: planning.BRIGHT[0]]
 
 
 @lru_cache(maxsize=16)
-def _node_tables(latlong: bool, rows: int, columns: int, cuts: int, rotation: float,
-                 corrected: bool) -> tuple[np.ndarray, np.ndarray]:
+def _node_tables(
+    latlong: bool, rows: int, columns: int, cuts: int, rotation: float, corrected: bool
+) -> tuple[np.ndarray, np.ndarray]:
     x, w = (np.array([0.5]), np.array([1.0])) if cuts == 1 else composite(cuts)
     scales = corrections(latlong, rows, columns).scales if corrected else None
     if latlong:

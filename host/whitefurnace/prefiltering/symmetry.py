@@ -1,4 +1,5 @@
 """Convolves by the symmetries of the cube: the orbits of grids and levels, and the launches of `octahedral.cl`."""
+
 from __future__ import annotations
 
 import math
@@ -47,25 +48,34 @@ def orbits(shape: Shape, lanes: int, most: int) -> tuple[Orbits, ...]:
     `lanes`."""
     if shape.latlong:
         rows, columns = shape.dims
-        i, j = np.mgrid[:rows // 2, :-(-columns // 8)].reshape(2, -1)
+        i, j = np.mgrid[: rows // 2, : -(-columns // 8)].reshape(2, -1)
         number = np.stack([i, 2 * j + 1], 1)
         theta, phi = (i + 0.5) * math.pi / rows, (2 * j + 1) * math.pi / columns
         direction = np.stack([np.sin(theta) * np.cos(phi), np.cos(theta), np.sin(theta) * np.sin(phi)])
     else:
-        i, j = np.mgrid[:-(-shape.size // 2), :-(-shape.size // 2)].reshape(2, -1)
+        i, j = np.mgrid[: -(-shape.size // 2), : -(-shape.size // 2)].reshape(2, -1)
         i, j = i[j <= i], j[j <= i]
         odd = 1 - shape.size % 2
         number = np.stack([2 * i + odd, 2 * j + odd], 1)
-        s = shape.coordinates()[shape.size // 2:]
+        s = shape.coordinates()[shape.size // 2 :]
         direction = cube_directions(np.full(len(i), 4), s[i], -s[j])
     order = np.lexsort((j % 4, i % 4, j // 4 % 2, i // 4 % 2, j // 8, i // 8))
     found, step = [], max(most // lanes, 1) * lanes
     for first in range(0, len(order), step):
-        part = order[first:first + step]
+        part = order[first : first + step]
         padded = -(-len(part) // lanes) * lanes
         index = np.pad(part, (0, padded - len(part)), mode="edge")
-        found.append(Orbits(shape, first, len(part), padded, 2 if shape.latlong else 6,
-                            number[index].astype(np.int32), direction[:, index]))
+        found.append(
+            Orbits(
+                shape,
+                first,
+                len(part),
+                padded,
+                2 if shape.latlong else 6,
+                number[index].astype(np.int32),
+                direction[:, index],
+            )
+        )
     return tuple(found)
 
 
@@ -140,8 +150,10 @@ class Octahedral:
         self._on_device: dict[Any, Buffer] = {}
 
     def _kernel(self, name: str, exchanges: int = 6) -> Kernel:
-        return self.device.build(source.octahedral().text, {
-            "W": self.lanes, "T": self.groups, "PRECISION": self.precision, "PERMS": exchanges}).kernel(name)
+        return self.device.build(
+            source.octahedral().text,
+            {"W": self.lanes, "T": self.groups, "PRECISION": self.precision, "PERMS": exchanges},
+        ).kernel(name)
 
     def launch(self, name: str, exchanges: int, count: int, args: Sequence[Any]) -> None:
         """A kernel over at least `count` work items."""
@@ -185,8 +197,15 @@ class Octahedral:
         series = lobe.series(min(inner.q0, lobe.reach) if inner else 0.0, outer.q1 if outer else 2.0, error)
         key = ("terms", series.terms.tobytes())
         windows = [x for w in (inner, outer) for x in ((w.q0, 1 / (w.q1 - w.q0)) if w else (0.0, 0.0))]
-        return (real(series.shift), real(series.slope), real(series.offset), np.int32(series.power),
-                np.int32(len(series.terms)), self._kept(key, series.terms), *(real(x) for x in windows))
+        return (
+            real(series.shift),
+            real(series.slope),
+            real(series.offset),
+            np.int32(series.power),
+            np.int32(len(series.terms)),
+            self._kept(key, series.terms),
+            *(real(x) for x in windows),
+        )
 
     def empty(self, splits: int, found: Orbits) -> Buffer:
         """Room for partial sums."""
@@ -195,8 +214,17 @@ class Octahedral:
     def _direction(self, found: Orbits) -> Buffer:
         return self._kept(("direction", found.shape, found.first, found.padded), found.direction)
 
-    def convolve(self, partial: Buffer, first: int, splits: int, found: Orbits, lobe: Lobe, part: Part,
-                 classes: Classes, error: float) -> None:
+    def convolve(
+        self,
+        partial: Buffer,
+        first: int,
+        splits: int,
+        found: Orbits,
+        lobe: Lobe,
+        part: Part,
+        classes: Classes,
+        error: float,
+    ) -> None:
         """Writes the partial sums of one part of a lobe into splits first … first + splits - 1 of `partial`.
 
         error: the share of its energy that the lobe's series may misplace.
@@ -206,33 +234,67 @@ class Octahedral:
 
         def head(count: int, *origin: Any) -> tuple[Any, ...]:
             chunk = RUN * math.ceil(count / splits / RUN)
-            return (partial, np.int32(found.padded), *origin, np.int32(count), np.int32(chunk), np.int32(first),
-                    self._direction(found), classes.node)
+            return (
+                partial,
+                np.int32(found.padded),
+                *origin,
+                np.int32(count),
+                np.int32(chunk),
+                np.int32(first),
+                self._direction(found),
+                classes.node,
+            )
 
         if part.outer is None:
-            self.device.launch(self._kernel("convolve_all", found.exchanges), (items, splits),
-                               (*head(classes.count), classes.moment, *series))
+            self.device.launch(
+                self._kernel("convolve_all", found.exchanges),
+                (items, splits),
+                (*head(classes.count), classes.moment, *series),
+            )
             return
         group = self._kept(("group", found.shape, found.first, found.padded), bounds(found.direction, self.lanes))
         tile = self._kept(("tile", part.grid), tile_bounds(part.grid))
         for origin, image in classes.images():
-            self.device.launch(self._kernel("convolve_close", found.exchanges), (items, splits),
-                               (*head(image.shape[1], np.int32(origin)), image, group, tile,
-                                self.kind.type(part.outer.q1), *series))
+            self.device.launch(
+                self._kernel("convolve_close", found.exchanges),
+                (items, splits),
+                (*head(image.shape[1], np.int32(origin)), image, group, tile, self.kind.type(part.outer.q1), *series),
+            )
 
     def apart(self, found: Orbits, lobe: Lobe, listed: Buffer) -> Buffer:
         """Sums over a list of single sources for every output, by the NDFs themselves."""
         real, partial = self.kind.type, self.empty(1, found)
         for k, (entry, numbers, weight) in enumerate(lobe.summands or ((None, (), 1.0),)):
-            program = self.device.build(source.apart(entry).text, {
-                "W": self.lanes, "T": 1, "PRECISION": self.precision, "PERMS": found.exchanges})
-            self.device.launch(program.kernel("convolve_apart"), (found.padded // self.lanes, found.exchanges),
-                               (partial, np.int32(found.padded), np.int32(listed.shape[0]), self._direction(found),
-                                listed, real(weight), np.int32(k > 0), *(real(value) for value in numbers)))
+            program = self.device.build(
+                source.apart(entry).text,
+                {"W": self.lanes, "T": 1, "PRECISION": self.precision, "PERMS": found.exchanges},
+            )
+            self.device.launch(
+                program.kernel("convolve_apart"),
+                (found.padded // self.lanes, found.exchanges),
+                (
+                    partial,
+                    np.int32(found.padded),
+                    np.int32(listed.shape[0]),
+                    self._direction(found),
+                    listed,
+                    real(weight),
+                    np.int32(k > 0),
+                    *(real(value) for value in numbers),
+                ),
+            )
         return partial
 
-    def unfold(self, level: Buffer, found: Orbits, whole: Buffer | None, close: Buffer | None, apart: Buffer | None,
-               per_norm: float, base: np.ndarray) -> None:
+    def unfold(
+        self,
+        level: Buffer,
+        found: Orbits,
+        whole: Buffer | None,
+        close: Buffer | None,
+        apart: Buffer | None,
+        per_norm: float,
+        base: np.ndarray,
+    ) -> None:
         """Writes the texels of these orbits into `level`, (dims, 3 or 4) float32.
 
         The value is the partial sums of both kinds of parts over their weights, plus `apart` times per_norm, plus the
@@ -242,9 +304,21 @@ class Octahedral:
         number = self._kept(("number", shape, found.first, found.padded), found.number)
         sums = (x for some in (whole, close, apart) for x in (some, np.int32(some.shape[0] if some else 0)))
         self.device.launch(
-            self._kernel("unfold", found.exchanges), (found.padded // self.lanes, found.exchanges),
-            (level, np.int32(level.shape[-1]), np.int32(found.padded), np.int32(found.count), np.int32(shape.size),
-             np.int32(shape.latlong), number, *sums, real(per_norm), *(real(x) for x in base)))
+            self._kernel("unfold", found.exchanges),
+            (found.padded // self.lanes, found.exchanges),
+            (
+                level,
+                np.int32(level.shape[-1]),
+                np.int32(found.padded),
+                np.int32(found.count),
+                np.int32(shape.size),
+                np.int32(shape.latlong),
+                number,
+                *sums,
+                real(per_norm),
+                *(real(x) for x in base),
+            ),
+        )
 
 
 @cache

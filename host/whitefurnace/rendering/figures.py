@@ -1,4 +1,5 @@
 """Draws the engine's picture, the full integral and their difference as a PNG."""
+
 from __future__ import annotations
 
 import textwrap
@@ -11,8 +12,15 @@ import numpy as np
 from whitefurnace.plot_style import colours_named, drawing
 
 
-def draw_side_by_side(path: Path, pictures: Sequence[np.ndarray], difference: np.ndarray, scale: float, engine: str,
-                caption: Sequence[str], stated: Mapping[str, str]) -> None:
+def draw_side_by_side(
+    path: Path,
+    pictures: Sequence[np.ndarray],
+    difference: np.ndarray,
+    scale: float,
+    engine: str,
+    caption: Sequence[str],
+    stated: Mapping[str, str],
+) -> None:
     """Draw the engine's picture, the truth and the map of their difference, one below the other where they are wide.
 
     pictures: two (h, w, 3) in [0, 1], shown pixel by pixel. difference: (h, w), NaN where there is none; its colours

@@ -1,5 +1,6 @@
 """Shades spheres from an engine's own files as that engine does: a grid of roughness and metalness, or a scene's
 materials."""
+
 from __future__ import annotations
 
 import math
@@ -57,8 +58,16 @@ class Lights:
 # ------------------------------------------------------------------------------------------------- shading
 
 
-def shade(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, base_color: Any, metalness: Any,
-          roughness: Any, insulator: Any = DIELECTRIC) -> np.ndarray:
+def shade(
+    engine: Engine,
+    lights: Lights,
+    n: np.ndarray,
+    v: np.ndarray,
+    base_color: Any,
+    metalness: Any,
+    roughness: Any,
+    insulator: Any = DIELECTRIC,
+) -> np.ndarray:
     """Radiance (m, 3) of surface points towards the viewer, lit by the environment alone, as the engine shades them.
 
     n, v: unit normals and view directions (3, m) in world axes, with n·v > 0. base_color: (3,) or (m, 3) in [0, 1].
@@ -104,8 +113,7 @@ def stored_directions(engine: Engine, d: np.ndarray) -> np.ndarray:
 
 
 def level(texels: np.ndarray, d: np.ndarray, border: int = 1) -> np.ndarray:
-    """A level read bilinearly in stored directions d (3, m): (m, 3). texels: a cube (6, s, s, 3), or an octahedral map.
-    """
+    """A level read bilinearly in stored directions d (3, m): (m, 3). texels: a cube (6, s, s, 3), or an octahedral map."""
     return bilinear(texels, d) if texels.ndim == 4 else octamap.read_bilinear(texels.astype(np.float64), d, border)
 
 
@@ -121,8 +129,7 @@ def trilinear(levels: Sequence[np.ndarray], d: np.ndarray, lod: np.ndarray, bord
 
 
 def specular(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Prefiltered radiance (m, 3) as the engine reads it for normals n, views v and perceptual roughness values (m,).
-    """
+    """Prefiltered radiance (m, 3) as the engine reads it for normals n, views v and perceptual roughness values (m,)."""
     lod = lods(engine, roughness, len(lights.levels), lights.levels[0].shape[1])
     return trilinear(lights.levels, stored_directions(engine, looked_up(engine, n, v, roughness)), lod, lights.border)
 
@@ -138,8 +145,9 @@ def irradiance(engine: Engine, lights: Lights, n: np.ndarray) -> np.ndarray:
     return trilinear(lights.levels, d, np.repeat(lod, d.shape[1]), lights.border)
 
 
-def split_sum(engine: Engine, dfg: np.ndarray | None, NoV: np.ndarray,
-              roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def split_sum(
+    engine: Engine, dfg: np.ndarray | None, NoV: np.ndarray, roughness: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The terms (A, B), (m,) each, of E = F0·A + B with F90 = 1, read from the engine's table in its own form; from
     `karis` where dfg is None."""
     if dfg is None:
@@ -157,8 +165,9 @@ def split_sum(engine: Engine, dfg: np.ndarray | None, NoV: np.ndarray,
     t, s = at[1] - i, at[0] - j
     below, right = np.minimum(i + 1, height - 1), np.minimum(j + 1, width - 1)
     texel = dfg[..., :2].astype(np.float64)
-    value = ((1 - t)[:, None] * ((1 - s)[:, None] * texel[i, j] + s[:, None] * texel[i, right])
-             + t[:, None] * ((1 - s)[:, None] * texel[below, j] + s[:, None] * texel[below, right]))
+    value = (1 - t)[:, None] * ((1 - s)[:, None] * texel[i, j] + s[:, None] * texel[i, right]) + t[:, None] * (
+        (1 - s)[:, None] * texel[below, j] + s[:, None] * texel[below, right]
+    )
     if engine.dfg.form == "multiscatter":  # (∫Fc, ∫1): E = mix(∫Fc, ∫1, F0)
         return value[:, 1] - value[:, 0], value[:, 0]
     return value[:, 0], value[:, 1]
@@ -179,44 +188,83 @@ Weights = tuple[np.ndarray, np.ndarray]
 """Weights of the specular radiance and of E/π, (m, 3) each."""
 
 
-def _split_sum(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-               NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
+def _split_sum(
+    A: np.ndarray,
+    B: np.ndarray,
+    color: np.ndarray,
+    metal: np.ndarray,
+    r: np.ndarray,
+    NoV: np.ndarray,
+    insulator: Any = DIELECTRIC,
+) -> Weights:
     """[Karis2013]: the energy that single scattering loses stays lost."""
     E = (insulator + (color - insulator) * metal) * A + B
     return E, color * (1 - metal) * (1 - E)
 
 
-def _scaled(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-            NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
+def _scaled(
+    A: np.ndarray,
+    B: np.ndarray,
+    color: np.ndarray,
+    metal: np.ndarray,
+    r: np.ndarray,
+    NoV: np.ndarray,
+    insulator: Any = DIELECTRIC,
+) -> Weights:
     """Filament: E · (1 + F0 (1/E₁ - 1)) with E₁ = A + B, the albedo for F0 = 1; the diffuse term gets 1 - E."""
     F0 = insulator + (color - insulator) * metal
     E = F0 * A + B
     return E * (1 + F0 * (1 / (A + B) - 1)), color * (1 - metal) * (1 - E)
 
 
-def _babylon(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-             NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
+def _babylon(
+    A: np.ndarray,
+    B: np.ndarray,
+    color: np.ndarray,
+    metal: np.ndarray,
+    r: np.ndarray,
+    NoV: np.ndarray,
+    insulator: Any = DIELECTRIC,
+) -> Weights:
     """Babylon.js 9: as Filament for the specular term. The diffuse term gets 1 - F0 of the light, whatever the specular
     term takes, which is Babylon's default (LEGACY_SPECULAR_ENERGY_CONSERVATION)."""
     return _scaled(A, B, color, metal, r, NoV, insulator)[0], color * (1 - insulator) * (1 - metal)
 
 
-def _fdez_aguera(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-                 NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
+def _fdez_aguera(
+    A: np.ndarray,
+    B: np.ndarray,
+    color: np.ndarray,
+    metal: np.ndarray,
+    r: np.ndarray,
+    NoV: np.ndarray,
+    insulator: Any = DIELECTRIC,
+) -> Weights:
     """three.js and Bevy: [FdezAguera2019] for the dielectric and for the metal alone, mixed by metalness."""
+
     def scattered(F0: Any) -> tuple[np.ndarray, np.ndarray]:
         once, lost, average = F0 * A + B, 1 - (A + B), F0 + (1 - F0) / 21
         return once, once * average / (1 - lost * average) * lost
 
     (once, again), (metal_once, metal_again) = scattered(insulator), scattered(color)
-    return (once + (metal_once - once) * metal,
-            again + (metal_again - again) * metal + color * (1 - metal) * (1 - once - again))
+    return (
+        once + (metal_once - once) * metal,
+        again + (metal_again - again) * metal + color * (1 - metal) * (1 - once - again),
+    )
 
 
-def _khronos(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray, r: np.ndarray,
-             NoV: np.ndarray, insulator: Any = DIELECTRIC) -> Weights:
+def _khronos(
+    A: np.ndarray,
+    B: np.ndarray,
+    color: np.ndarray,
+    metal: np.ndarray,
+    r: np.ndarray,
+    NoV: np.ndarray,
+    insulator: Any = DIELECTRIC,
+) -> Weights:
     """Khronos glTF Sample Viewer: [FdezAguera2019] with a Fresnel term that depends on roughness, multiplied by
     radiance."""
+
     def fresnel(F0: Any) -> np.ndarray:
         k = F0 + (np.maximum(1 - r, F0) - F0) * (1 - NoV) ** 5
         once, lost, average = k * A + B, 1 - (A + B), F0 + (1 - F0) / 21
@@ -227,7 +275,12 @@ def _khronos(A: np.ndarray, B: np.ndarray, color: np.ndarray, metal: np.ndarray,
 
 
 SHADINGS: Mapping[str, Callable[..., Weights]] = {
-    "split_sum": _split_sum, "scaled": _scaled, "babylon": _babylon, "fdez_aguera": _fdez_aguera, "khronos": _khronos}
+    "split_sum": _split_sum,
+    "scaled": _scaled,
+    "babylon": _babylon,
+    "fdez_aguera": _fdez_aguera,
+    "khronos": _khronos,
+}
 """By `Engine.shading`, a function from (A, B, base colour, metalness, r, NoV, F0 of insulators) to the weights of
 radiance and of E/π."""
 
@@ -255,8 +308,9 @@ def read_lights(engine: Engine, folder: str | os.PathLike[str], stem: str) -> Li
     chain = found("specular")
     if chain is None:
         given = ", ".join(file.name.replace("{stem}", stem) for file in engine.file)
-        raise UnsupportedError(f"{engine.name} is given {given} and filters that itself: there is no prefiltered chain "
-                               f"to render from")
+        raise UnsupportedError(
+            f"{engine.name} is given {given} and filters that itself: there is no prefiltered chain to render from"
+        )
     file, path = chain
     sh: np.ndarray | None = None
     border = 1
@@ -276,12 +330,21 @@ def read_lights(engine: Engine, folder: str | os.PathLike[str], stem: str) -> Li
     diffuse, table = found("irradiance"), found("dfg")
     notices = []
     if engine.sh is None and diffuse is None:
-        notices.append("its diffuse light is the level of roughness 1"
-                       + ("" if engine.proven else ", which stands in for what the engine makes of the image itself"))
+        notices.append(
+            "its diffuse light is the level of roughness 1"
+            + ("" if engine.proven else ", which stands in for what the engine makes of the image itself")
+        )
     if table is None:
         notices.append("it has no split-sum table of ours: Karis's fit stands in for it")
-    return Lights(levels, None if diffuse is None else _texels(diffuse[1], cube=True)[0], sh,
-                  None if table is None else _table(*table), border, tuple(map(str, paths)), tuple(notices))
+    return Lights(
+        levels,
+        None if diffuse is None else _texels(diffuse[1], cube=True)[0],
+        sh,
+        None if table is None else _table(*table),
+        border,
+        tuple(map(str, paths)),
+        tuple(notices),
+    )
 
 
 def _read_everything(engine: Engine, folder: Path, stem: str) -> Lights:
@@ -306,8 +369,12 @@ def _read_everything(engine: Engine, folder: Path, stem: str) -> Lights:
         *images, table = (read_stored(path) for path in read)
         *levels_, cube = (image[..., :3].reshape(-1, image.shape[1], image.shape[1], 3) for image in images)
         levels = tuple(levels_)
-    if not levels or any(t.ndim != 4 or t.shape[0] != 6 or t.shape[1] != t.shape[2] or t.shape[3] != 3
-                         for t in (*levels, cube)) or table.ndim != 3 or table.shape[2] < 2:
+    if (
+        not levels
+        or any(t.ndim != 4 or t.shape[0] != 6 or t.shape[1] != t.shape[2] or t.shape[3] != 3 for t in (*levels, cube))
+        or table.ndim != 3
+        or table.shape[2] < 2
+    ):
         raise InputError(f"{read[0]}: its levels are not cubes of (6, s, s, 3) with a table (h, w, 2)")
     return Lights(levels, cube, None, table, read=tuple(map(str, read)))
 
@@ -450,8 +517,16 @@ def sphere(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return index, cover[index], np.stack([x, y, np.sqrt(1 - x * x - y * y)])
 
 
-def grid(engine: Engine, lights: Lights, *, columns: int = 7, rows: int = 3, size: int = 128,
-         base_color: Sequence[float] = (1.0, 1.0, 1.0), background: str = "environment") -> np.ndarray:
+def grid(
+    engine: Engine,
+    lights: Lights,
+    *,
+    columns: int = 7,
+    rows: int = 3,
+    size: int = 128,
+    base_color: Sequence[float] = (1.0, 1.0, 1.0),
+    background: str = "environment",
+) -> np.ndarray:
     """A picture of spheres, (rows · size, columns · size, 3) linear radiance, seen along -z.
 
     Roughness goes from 0 to 1 from left to right, metalness from 0 to 1 from the top down (1 where there is one row).
@@ -461,8 +536,9 @@ def grid(engine: Engine, lights: Lights, *, columns: int = 7, rows: int = 3, siz
     return drawn(engine, lights, of_grid(columns, rows, base_color), size=size, background=background)
 
 
-def drawn(engine: Engine, lights: Lights, spheres: SphereLayout, *, size: int = 128,
-          background: str = "environment") -> np.ndarray:
+def drawn(
+    engine: Engine, lights: Lights, spheres: SphereLayout, *, size: int = 128, background: str = "environment"
+) -> np.ndarray:
     """A picture of a layout of spheres, (rows · size, columns · size, 3) linear radiance, as `grid`.
 
     Where the last row has fewer spheres, the rest is background. Raises UsageError for values out of range.
@@ -479,11 +555,11 @@ def drawn(engine: Engine, lights: Lights, spheres: SphereLayout, *, size: int = 
     for i in range(rows):
         band = slice(i * size, (i + 1) * size)
         picture[band] = _behind(engine, lights, picture.shape, band) if background == "environment" else GREY
-        for j, of in enumerate(spheres.spheres[i * columns:(i + 1) * columns]):
-            cell = picture[band, j * size:(j + 1) * size].reshape(-1, 3)  # a copy
+        for j, of in enumerate(spheres.spheres[i * columns : (i + 1) * columns]):
+            cell = picture[band, j * size : (j + 1) * size].reshape(-1, 3)  # a copy
             lit = shade(engine, lights, n, v, of.base_color, of.metalness, of.roughness, np.asarray(of.insulator))
             cell[index] += (lit - cell[index]) * cover[:, None]
-            picture[band, j * size:(j + 1) * size] = cell.reshape(size, size, 3)
+            picture[band, j * size : (j + 1) * size] = cell.reshape(size, size, 3)
     return picture
 
 
@@ -509,10 +585,20 @@ def srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, for_: str, size: int = 128,
-           columns: int = 7, rows: int | None = None, exposure: float = 0.0,
-           base_color: Sequence[float] | None = None, background: str = "environment",
-           scene: str | os.PathLike[str] | None = None, force: bool = False) -> Rendered:
+def render(
+    manifest: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    for_: str,
+    size: int = 128,
+    columns: int = 7,
+    rows: int | None = None,
+    exposure: float = 0.0,
+    base_color: Sequence[float] | None = None,
+    background: str = "environment",
+    scene: str | os.PathLike[str] | None = None,
+    force: bool = False,
+) -> Rendered:
     """Draw the spheres of a bake for one engine into a PNG in sRGB, as radiance times 2^exposure, clipped at 1.
 
     manifest: of the bake. for_: the engine. size: pixels of a sphere's cell. columns, rows: of the grid; 3 rows by
@@ -534,5 +620,15 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
     spheres = layout_of(scene, columns, rows, base_color)
     picture = drawn(engine, lights, spheres, size=size, background=background)
     write_png(output, srgb(picture * 2.0**exposure))
-    return Rendered(output, engine.name, picture.shape[1], picture.shape[0], spheres.roughness, spheres.metalness,
-                    exposure, lights.read, (*lights.notices, *spheres.notices), spheres.placed())
+    return Rendered(
+        output,
+        engine.name,
+        picture.shape[1],
+        picture.shape[0],
+        spheres.roughness,
+        spheres.metalness,
+        exposure,
+        lights.read,
+        (*lights.notices, *spheres.notices),
+        spheres.placed(),
+    )

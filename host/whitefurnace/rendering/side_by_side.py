@@ -1,5 +1,6 @@
 """Draws an engine's picture of spheres, the full reflectance integral of the same pixels, and their difference side by
 side."""
+
 from __future__ import annotations
 
 import math
@@ -168,8 +169,12 @@ class Spheres:
         self._diffuse: dict[Triple, np.ndarray] = {}
         self._diffuse_lit: dict[Triple, np.ndarray] = {}
 
-    def alike(self, roughness: float, spheres: Sequence[MaterialSphere], tolerance: float,
-              ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
+    def alike(
+        self,
+        roughness: float,
+        spheres: Sequence[MaterialSphere],
+        tolerance: float,
+    ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
         """The truth of spheres of one roughness.
 
         Returns ((m, 3) by the environment for each sphere, (m, 3) by the further lights for each, samples a point,
@@ -266,8 +271,15 @@ class Spheres:
                 given = {name: v[c] if isinstance(v, tuple) else v for name, v in light.given.items()}
                 placed = in_frame(light, given, points)
                 numbers: dict[str, Any] = {**own, **{f"light_{name}": v[:, None] for name, v in placed.items()}}
-                values = radiance(light=Chosen(light.model, {}), NoV=points.NoV[:, None], phi=0.0, tolerance=1e-4,
-                                  device=self.truth.device, **models, **numbers).values
+                values = radiance(
+                    light=Chosen(light.model, {}),
+                    NoV=points.NoV[:, None],
+                    phi=0.0,
+                    tolerance=1e-4,
+                    device=self.truth.device,
+                    **models,
+                    **numbers,
+                ).values
                 if not any(isinstance(v, tuple) for v in light.given.values()):
                     total += np.asarray(values, np.float64).reshape(total.shape[:2])[..., None]
                     break
@@ -324,11 +336,17 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
     for name, value in (("rotate", turn), ("exposure", exposure)):
         if not isinstance(value, (int, float)):
             raise InputError(f"{manifest} tells no {name}: it is not the manifest of a bake")
-    found = environment(item, rotate=float(turn), exposure=float(exposure),  # type: ignore[arg-type]
-                        nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse")
+    found = environment(
+        item,
+        rotate=float(turn),
+        exposure=float(exposure),  # type: ignore[arg-type]
+        nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse",
+    )
     if found.digest != source.get("sha256"):
-        raise InputError(f"{given} is not the image that {manifest} was baked from: its sha256 is {found.digest[:16]}…"
-                         f", the bake's is {str(source.get('sha256'))[:16]}…")
+        raise InputError(
+            f"{given} is not the image that {manifest} was baked from: its sha256 is {found.digest[:16]}…"
+            f", the bake's is {str(source.get('sha256'))[:16]}…"
+        )
     return without_sun(found, str(recipe.get("sun", "keep")))[0]
 
 
@@ -344,10 +362,21 @@ def ndf_of(manifest: str | os.PathLike[str]) -> Spec:
     return Chosen(chosen("ndf", entry["name"]).model, given)
 
 
-def panels(engine: Engine, lights: Lights, env: Environment, device: Device, material: Material,
-           layout: SphereLayout, *, size: int = 128, background: str = "environment", tolerance: float = TOLERANCE,
-           certify: int = 1, further: Sequence[Spec] = (),
-           progress: Callable[[str, float], None] | None = None) -> Shown:
+def panels(
+    engine: Engine,
+    lights: Lights,
+    env: Environment,
+    device: Device,
+    material: Material,
+    layout: SphereLayout,
+    *,
+    size: int = 128,
+    background: str = "environment",
+    tolerance: float = TOLERANCE,
+    certify: int = 1,
+    further: Sequence[Spec] = (),
+    progress: Callable[[str, float], None] | None = None,
+) -> Shown:
     """The spheres of `shading.drawn` as the engine shows them, in truth, and their difference.
 
     material: the reflection model of the truth; roughness below MIRROR is a mirror in it. tolerance: of the 99th
@@ -373,30 +402,33 @@ def panels(engine: Engine, lights: Lights, env: Environment, device: Device, mat
     clock |= {"truth": 0.0, "certificate": 0.0}
     for j, (roughness, those) in enumerate(groups.items()):
         begin = time.perf_counter()
-        true, extra, count, estimate, terms = spheres.alike(roughness, [layout.spheres[k] for k in those],
-                                                            tolerance)
+        true, extra, count, estimate, terms = spheres.alike(roughness, [layout.spheres[k] for k in those], tolerance)
         samples.append(count)
         estimates.append(estimate)
         for k, by_sky, by_lights in zip(those, true, extra, strict=True):
             one, (i, across) = layout.spheres[k], divmod(k, layout.columns)
-            where = np.s_[i * size:(i + 1) * size, across * size:(across + 1) * size]
-            lit = shading.shade(engine, lights, n, points.v, one.base_color, one.metalness, one.roughness,
-                                  np.asarray(one.insulator))
+            where = np.s_[i * size : (i + 1) * size, across * size : (across + 1) * size]
+            lit = shading.shade(
+                engine, lights, n, points.v, one.base_color, one.metalness, one.roughness, np.asarray(one.insulator)
+            )
             whole = by_sky + by_lights
             apart = (lit - by_sky) / np.maximum(whole @ LUMINANCE, max(DARK * mean, 1e-30))[:, None]
             shown[where] += _over(np.zeros((size, size, 3)), index, cover, by_lights)
             picture[where] = _over(picture[where], index, cover, whole)
             difference[where] = _over(difference[where], index, (cover > 0.5).astype(float), apart)
-            covered[where] = _over(np.zeros((size, size, 1)), index, (cover > 0.5).astype(float),
-                                   np.ones((len(index), 1)))[..., 0] > 0
+            covered[where] = (
+                _over(np.zeros((size, size, 1)), index, (cover > 0.5).astype(float), np.ones((len(index), 1)))[..., 0]
+                > 0
+            )
         clock["truth"] += time.perf_counter() - begin
         begin = time.perf_counter()
         certificate += _certificate(truth, terms, points, roughness, j * certify, certify, count, mean)
         clock["certificate"] += time.perf_counter() - begin
         if progress:
             progress("truth", (j + 1) / len(groups))
-    return Shown(shown, picture, difference, tuple(samples), tuple(estimates), tuple(certificate), clock, covered,
-                 tuple(groups))
+    return Shown(
+        shown, picture, difference, tuple(samples), tuple(estimates), tuple(certificate), clock, covered, tuple(groups)
+    )
 
 
 def _over(cell: np.ndarray, index: np.ndarray, cover: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -406,8 +438,16 @@ def _over(cell: np.ndarray, index: np.ndarray, cover: np.ndarray, values: np.nda
     return flat.reshape(cell.shape)
 
 
-def _certificate(truth: Truth, terms: Mapping[str, Term], points: Points, roughness: float, first: int, many: int,
-                 count: int, mean: float) -> list[Certified]:
+def _certificate(
+    truth: Truth,
+    terms: Mapping[str, Term],
+    points: Points,
+    roughness: float,
+    first: int,
+    many: int,
+    count: int,
+    mean: float,
+) -> list[Certified]:
     """Pixels by the golden ratio over the sphere, of one variant after the other."""
     found = []
     variants = [(name, one, k) for name, one in terms.items() for k in range(one.sets)]
@@ -432,14 +472,31 @@ def scale_of(shown: Shown) -> float:
     return min(next(k * power for k in (1, 2, 5, 10) if k * power >= most * (1 - 1e-9)), 1.0)
 
 
-def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, for_: str,
-           truth: str | os.PathLike[str], size: int = 128, columns: int = 7, rows: int | None = None,
-           exposure: float = 0.0, base_color: Sequence[float] | None = None, background: str = "environment",
-           scene: str | os.PathLike[str] | None = None, tolerance: float | None = None, certify: int = 1,
-           ndf: Spec | None = None, dielectric: Spec | None = None, metal: Spec | None = None,
-           diffuse: Spec | None = None, multiscatter: bool = False, light: Sequence[Spec] = (),
-           device: Device | str | None = None, force: bool = False,
-           progress: Callable[[str, float], None] | None = None) -> Rendered:
+def render(
+    manifest: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    *,
+    for_: str,
+    truth: str | os.PathLike[str],
+    size: int = 128,
+    columns: int = 7,
+    rows: int | None = None,
+    exposure: float = 0.0,
+    base_color: Sequence[float] | None = None,
+    background: str = "environment",
+    scene: str | os.PathLike[str] | None = None,
+    tolerance: float | None = None,
+    certify: int = 1,
+    ndf: Spec | None = None,
+    dielectric: Spec | None = None,
+    metal: Spec | None = None,
+    diffuse: Spec | None = None,
+    multiscatter: bool = False,
+    light: Sequence[Spec] = (),
+    device: Device | str | None = None,
+    force: bool = False,
+    progress: Callable[[str, float], None] | None = None,
+) -> Rendered:
     """Draw the spheres of a bake for one engine, the truth and their difference side by side.
 
     A PNG gets three panels with a scale. An EXR gets the layers engine, truth and difference in float32, without
@@ -476,40 +533,95 @@ def render(manifest: str | os.PathLike[str], output: str | os.PathLike[str], *, 
     further = [chosen("light", spec) for spec in light]
     on = device if isinstance(device, Device) else choose_device(device)
     env = source_of(manifest, truth, on)
-    shown = panels(engine, lights, env, on, material, spheres, size=size, background=background, tolerance=bound,
-                   certify=certify, further=further, progress=progress)
+    shown = panels(
+        engine,
+        lights,
+        env,
+        on,
+        material,
+        spheres,
+        size=size,
+        background=background,
+        tolerance=bound,
+        certify=certify,
+        further=further,
+        progress=progress,
+    )
     scale = scale_of(shown)
     notices = [*lights.notices, *env.notices, *spheres.notices]
     if further:
-        notices.append("what lights besides the environment add is the same in both pictures: what differs is the "
-                       "environment's")
+        notices.append(
+            "what lights besides the environment add is the same in both pictures: what differs is the environment's"
+        )
     missed = [f"{r:.3g}" for r, e in zip(shown.roughness, shown.estimates, strict=True) if e > bound]
     if missed:
-        notices.append(f"the tolerance of {bound:g} is missed at roughness {', '.join(missed)}: "
-                       f"{max(shown.estimates):.2g} after {max(shown.samples)} samples a pixel")
-    made = Rendered(output, engine.name, shown.engine.shape[1], shown.engine.shape[0], spheres.roughness,
-                    spheres.metalness, exposure, lights.read, tuple(notices), spheres.placed(), env.digest, bound,
-                    shown.samples, shown.estimates, shown.certificate, shown.error, shown.within(0.5),
-                    shown.within(MOST), multiscatter, scale, shown.seconds)
+        notices.append(
+            f"the tolerance of {bound:g} is missed at roughness {', '.join(missed)}: "
+            f"{max(shown.estimates):.2g} after {max(shown.samples)} samples a pixel"
+        )
+    made = Rendered(
+        output,
+        engine.name,
+        shown.engine.shape[1],
+        shown.engine.shape[0],
+        spheres.roughness,
+        spheres.metalness,
+        exposure,
+        lights.read,
+        tuple(notices),
+        spheres.placed(),
+        env.digest,
+        bound,
+        shown.samples,
+        shown.estimates,
+        shown.certificate,
+        shown.error,
+        shown.within(0.5),
+        shown.within(MOST),
+        multiscatter,
+        scale,
+        shown.seconds,
+    )
     if output.suffix.lower() == ".exr":
         layers = ("difference", "engine", "truth")  # the order in which readers list them
-        write_exr(output, np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
-                  channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"), attributes=_stated(made))
+        write_exr(
+            output,
+            np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
+            channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"),
+            attributes=_stated(made),
+        )
     else:
-        draw_side_by_side(output, [shading.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
-                         np.where(shown.covered, shown.luminance, np.nan), scale, engine.name, _caption(made),
-                         {key: str(value) for key, value in _stated(made).items()})
+        draw_side_by_side(
+            output,
+            [shading.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
+            np.where(shown.covered, shown.luminance, np.nan),
+            scale,
+            engine.name,
+            _caption(made),
+            {key: str(value) for key, value in _stated(made).items()},
+        )
     return made
 
 
 def _stated(made: Rendered) -> dict[str, str | float | int]:
     """Values that are stored with the picture."""
-    return {"engine": made.engine, "source": made.source, "tolerance": made.tolerance, "error": made.error,
-            "certified": len(made.certificate), "samples": " ".join(map(str, made.samples)),
-            "difference_median": made.median, "difference_95": made.most, "difference_scale": made.scale,
-            "scattering": "multiple" if made.multiscatter else "single",
-            **({"materials": "; ".join(f"{one['name']} ({one['row']}, {one['column']})" for one in made.materials)}
-               if made.materials else {})}
+    return {
+        "engine": made.engine,
+        "source": made.source,
+        "tolerance": made.tolerance,
+        "error": made.error,
+        "certified": len(made.certificate),
+        "samples": " ".join(map(str, made.samples)),
+        "difference_median": made.median,
+        "difference_95": made.most,
+        "difference_scale": made.scale,
+        "scattering": "multiple" if made.multiscatter else "single",
+        **(
+            {"materials": "; ".join(f"{one['name']} ({one['row']}, {one['column']})" for one in made.materials)}
+            if made.materials
+            else {}
+        ),
+    }
 
 
 def _caption(made: Rendered) -> tuple[str, ...]:
@@ -519,7 +631,8 @@ def _caption(made: Rendered) -> tuple[str, ...]:
         across, down = f"{len(made.materials)} materials of a scene, row by row", ""
     scattering = f"truth: facets scatter {'again, by scale' if made.multiscatter else 'once'}"
     held = f", within {made.error:.1e} at {len(made.certificate)} pixels of a quadrature" if made.certificate else ""
-    return (", ".join(filter(None, (across, down))),
-            f"difference: {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of "
-            "100",
-            scattering + held)
+    return (
+        ", ".join(filter(None, (across, down))),
+        f"difference: {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of 100",
+        scattering + held,
+    )

@@ -1,4 +1,5 @@
 """Draws thumbnails of a bake: a panorama, and spheres that mirror its levels, through one tone curve."""
+
 from __future__ import annotations
 
 import math
@@ -174,8 +175,10 @@ def _reduced(texels: np.ndarray) -> np.ndarray:
 
 def _halved(texels: np.ndarray) -> np.ndarray:
     """Means (…, h/2, w/2, c) of 2 × 2 values (…, h, w, c)."""
-    return np.asarray((texels[..., ::2, ::2, :] + texels[..., 1::2, ::2, :]
-                       + texels[..., ::2, 1::2, :] + texels[..., 1::2, 1::2, :]) / 4)
+    return np.asarray(
+        (texels[..., ::2, ::2, :] + texels[..., 1::2, ::2, :] + texels[..., ::2, 1::2, :] + texels[..., 1::2, 1::2, :])
+        / 4
+    )
 
 
 def _read(texels: np.ndarray, what: str, matrix: Matrix) -> np.ndarray:

@@ -5,6 +5,7 @@ An engine shows the split sum: its levels have n = v = r, and its table knows no
 ∫ L(l) f(l, v)(n·l) dω, with every facet's own view, Fresnel and masking inside. `radiance.py` computes the same for a
 few cells by quadrature in float64; a picture's error is stated against it.
 """
+
 from __future__ import annotations
 
 import math
@@ -123,8 +124,15 @@ class Term:
         return min(float(found[0, 0]), 1.0)
 
 
-def term(*, roughness: float | None = None, ndf: Spec | None = None, masking: Spec = "smith", fresnel: Spec = "one",
-         diffuse: Spec | None = None, **parameters: Any) -> Term:
+def term(
+    *,
+    roughness: float | None = None,
+    ndf: Spec | None = None,
+    masking: Spec = "smith",
+    fresnel: Spec = "one",
+    diffuse: Spec | None = None,
+    **parameters: Any,
+) -> Term:
     """A term from specs, an NDF's perceptual roughness and further parameters; a preset's RGB become three variants.
 
     Raises UsageError, and UnsupportedError for an anisotropic NDF.
@@ -132,15 +140,19 @@ def term(*, roughness: float | None = None, ndf: Spec | None = None, masking: Sp
     slots = slots_of(integral("albedo"), ndf, masking, fresnel, diffuse, None)
     given: dict[str, Any] = {}
     if ndf is not None and not slots["ndf"].model.isotropic:
-        raise UnsupportedError(f"ndf {slots['ndf'].model.name} is anisotropic: the truth of a picture is of isotropic "
-                               "ones")
+        raise UnsupportedError(
+            f"ndf {slots['ndf'].model.name} is anisotropic: the truth of a picture is of isotropic ones"
+        )
     if ndf is not None and roughness is not None:
         given |= rows_of_roughness(slots["ndf"], np.asarray(float(roughness)))
     models = {}
     for slot, choice in slots.items():
         models[slot] = Chosen(choice.model, {})
-        given |= {f"{slot}_{p.name}": p.default for p in choice.model.parameters if p.default is not None
-                  and f"{slot}_{p.name}" not in given}
+        given |= {
+            f"{slot}_{p.name}": p.default
+            for p in choice.model.parameters
+            if p.default is not None and f"{slot}_{p.name}" not in given
+        }
         given |= {f"{slot}_{name}": value for name, value in choice.given.items()}
     given |= parameters
     arrays = {name: np.atleast_1d(np.asarray(value, np.float64)) for name, value in given.items()}
@@ -251,8 +263,13 @@ class Truth:
             return cut(self.env, self.excess, cuts)
         return blocks(self.env, self.excess, max(BLOCK * width, FINEST) if count > LIGHTS else 0.0)
 
-    def reflected(self, found: Term, points: Points, count: int, progress: Callable[[float], None] | None = None,
-                  ) -> tuple[np.ndarray, np.ndarray]:
+    def reflected(
+        self,
+        found: Term,
+        points: Points,
+        count: int,
+        progress: Callable[[float], None] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
         """(radiance (m, S, 3), albedo (m, S)) of points under a term.
 
         count: samples of each point. progress: called with the share of points that is done.
@@ -267,8 +284,7 @@ class Truth:
         return value if lights is None else value + self.gathered(found, points, lights), E
 
     def mirror(self, found: Term, points: Points) -> tuple[np.ndarray, np.ndarray]:
-        """As `reflected`, for a perfectly smooth surface: L(reflect(v)) F(n·v) [Hoffman2012, "Image Based Lighting"].
-        """
+        """As `reflected`, for a perfectly smooth surface: L(reflect(v)) F(n·v) [Hoffman2012, "Image Based Lighting"]."""
         entry, m = found.models["fresnel"].model, points.n.shape[1]
         rows = [np.broadcast_to(found.parameters[f"fresnel_{p.name}"], (found.sets,)) for p in entry.parameters]
         cells = np.stack([np.tile(points.NoV, found.sets), *(np.repeat(row, m) for row in rows)])
@@ -300,16 +316,29 @@ class Truth:
         texels."""
         frame = frame_of(points.n[:, k].tolist())
         x, y, z = frame @ points.v[:, k]
-        given: dict[str, Any] = {name: float(np.broadcast_to(v, (found.sets,))[variant])
-                                 for name, v in found.parameters.items()}
+        given: dict[str, Any] = {
+            name: float(np.broadcast_to(v, (found.sets,))[variant]) for name, v in found.parameters.items()
+        }
         models: dict[str, Any] = dict(found.models)
         precision = 64 if self.device.fp64 else 32
-        return np.asarray(radiance(environment=self.env, normal=points.n[:, k].tolist(), NoV=float(min(z, 1.0)),
-                                   phi=math.atan2(y, x), precision=precision, tolerance=QUADRATURE, device=self.device,
-                                   **models, **given).values, np.float64)
+        return np.asarray(
+            radiance(
+                environment=self.env,
+                normal=points.n[:, k].tolist(),
+                NoV=float(min(z, 1.0)),
+                phi=math.atan2(y, x),
+                precision=precision,
+                tolerance=QUADRATURE,
+                device=self.device,
+                **models,
+                **given,
+            ).values,
+            np.float64,
+        )
 
-    def sums(self, found: Term, points: Points, count: int, sampler: Sampler,
-             progress: Callable[[float], None] | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def sums(
+        self, found: Term, points: Points, count: int, sampler: Sampler, progress: Callable[[float], None] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Means over `count` samples of weight × (L - base), (m, S, 3), and of the weights, (m, S)."""
         device, size, width = self.device, sampler.size, found.width(self.device)
         while size < LARGEST_SOURCE and math.pi / 2 / size > SHARPER * width:
@@ -321,8 +350,9 @@ class Truth:
         total = self._over(found, numbers, terms, how, "reflect", points, count, between, 4, progress) / count
         return total[..., :3], total[..., 3]
 
-    def gathered(self, found: Term, points: Points, lights: np.ndarray,
-                 progress: Callable[[float], None] | None = None) -> np.ndarray:
+    def gathered(
+        self, found: Term, points: Points, lights: np.ndarray, progress: Callable[[float], None] | None = None
+    ) -> np.ndarray:
         """∑ Ω L f (n·l) over lights (k, 6), unit directions and Ω L: (m, S, 3)."""
         if not len(lights):
             return np.zeros((points.n.shape[1], found.sets, 3))
@@ -330,41 +360,78 @@ class Truth:
         table[:, :3], table[:, 4:7] = lights[:, :3], lights[:, 3:]
         numbers, terms = self._numbers(found)
         how = "COSINE" if "diffuse" in found.models else "NORMALS"
-        return self._over(found, numbers, terms, how, "gather", points, len(lights),
-                          (self.device.array(table.astype(self.kind)),), 3, progress)
+        return self._over(
+            found,
+            numbers,
+            terms,
+            how,
+            "gather",
+            points,
+            len(lights),
+            (self.device.array(table.astype(self.kind)),),
+            3,
+            progress,
+        )
 
     def _numbers(self, found: Term) -> tuple[np.ndarray, int]:
         """(k, S) numbers of the models as kernels take them, and the terms of the table of Smith's area."""
         models = {slot: choice.model for slot, choice in found.models.items()}
         part = Part(self.device, integral("albedo"), models, self.precision)
-        grid = grid_of(integral("albedo"), found.models, {
-            **{name: np.broadcast_to(v, (found.sets,)) for name, v in found.parameters.items()}, "NoV": 1.0}, None)
+        grid = grid_of(
+            integral("albedo"),
+            found.models,
+            {**{name: np.broadcast_to(v, (found.sets,)) for name, v in found.parameters.items()}, "NoV": 1.0},
+            None,
+        )
         numbers, terms, _ = part.cells(grid.rows(part, 0, found.sets), self.precision)
-        return numbers[len(part.view):], terms
+        return numbers[len(part.view) :], terms
 
-    def _over(self, found: Term, numbers: np.ndarray, terms: int, how: str, name: str, points: Points, count: int,
-              between: Sequence[Any], components: int, progress: Callable[[float], None] | None) -> np.ndarray:
+    def _over(
+        self,
+        found: Term,
+        numbers: np.ndarray,
+        terms: int,
+        how: str,
+        name: str,
+        points: Points,
+        count: int,
+        between: Sequence[Any],
+        components: int,
+        progress: Callable[[float], None] | None,
+    ) -> np.ndarray:
         """(m, S, components) sums of a kernel of `truth.cl` over `count` samples or lights."""
         device, sets = self.device, found.sets
         models = {slot: choice.model for slot, choice in found.models.items()}
         lanes = device.lanes(self.precision)
-        kernel = device.build(source.truth(models, how, sets, terms).text,
-                              {"W": lanes, "T": 1, "PRECISION": self.precision}).kernel(name)
+        kernel = device.build(
+            source.truth(models, how, sets, terms).text, {"W": lanes, "T": 1, "PRECISION": self.precision}
+        ).kernel(name)
         cells = device.array(np.repeat(numbers, lanes, 1).astype(self.kind))
         step, splits, m = lanes * device.local_size, -(-count // CHUNK), points.n.shape[1]
         tile = max(SAMPLES_A_LAUNCH // count // step, 1) * step
         surface = points.surface()
         out = np.empty((m, sets, components))
         for begin in range(0, m, tile):
-            some = surface[:, begin:begin + tile]
+            some = surface[:, begin : begin + tile]
             held = some.shape[1]
             padded = -(-held // step) * step
             block = np.pad(some, ((0, 0), (0, padded - held)), mode="edge").astype(self.kind)
             partial = device.empty((splits, sets, components, padded), self.kind)
-            device.launch(kernel, (padded // lanes, splits),
-                          (partial, np.int32(padded), np.int32(count), np.int32(CHUNK), device.array(block), *between,
-                           np.int32(sets * lanes), cells))
-            out[begin:begin + held] = partial.read().sum(0, dtype=np.float64)[:, :, :held].transpose(2, 0, 1)
+            device.launch(
+                kernel,
+                (padded // lanes, splits),
+                (
+                    partial,
+                    np.int32(padded),
+                    np.int32(count),
+                    np.int32(CHUNK),
+                    device.array(block),
+                    *between,
+                    np.int32(sets * lanes),
+                    cells,
+                ),
+            )
+            out[begin : begin + held] = partial.read().sum(0, dtype=np.float64)[:, :, :held].transpose(2, 0, 1)
             if progress:
                 progress((begin + held) / m)
         return out
@@ -386,7 +453,7 @@ class Truth:
         if entry.name in VISIBLE:  # Ω = 4 A/(N D)
             lod = np.full(count, 0.5 * math.log2(texels * 4 / count))
             return "VISIBLE", np.stack([u, np.cos(phi), np.sin(phi), lod], 1)
-        own = numbers[:len(entry.arguments), :1]
+        own = numbers[: len(entry.arguments), :1]
         sin2 = quantiles(self.device, entry, own, u)
         s, z = np.sqrt(sin2), np.sqrt(np.maximum(1 - sin2, 1e-12))
         cells = np.concatenate([np.stack([z, sin2]), np.repeat(own, count, 1)])

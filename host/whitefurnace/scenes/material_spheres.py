@@ -1,4 +1,5 @@
 """Lays out the spheres of a picture: roughness across and metalness down, or the materials of a scene."""
+
 from __future__ import annotations
 
 import os
@@ -59,9 +60,22 @@ class SphereLayout:
 
     def placed(self) -> tuple[dict[str, object], ...]:
         """For a scene: each material's name, its row and column from 1, and the values of its sphere."""
-        return tuple({"name": s.name, "row": k // self.columns + 1, "column": k % self.columns + 1,
-                      "base_color": s.base_color, "metalness": s.metalness, "roughness": s.roughness,
-                      "f0": s.insulator} for k, s in enumerate(self.spheres)) if self.scene else ()
+        return (
+            tuple(
+                {
+                    "name": s.name,
+                    "row": k // self.columns + 1,
+                    "column": k % self.columns + 1,
+                    "base_color": s.base_color,
+                    "metalness": s.metalness,
+                    "roughness": s.roughness,
+                    "f0": s.insulator,
+                }
+                for k, s in enumerate(self.spheres)
+            )
+            if self.scene
+            else ()
+        )
 
 
 def steps(count: int, alone: float) -> tuple[float, ...]:
@@ -103,19 +117,30 @@ def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
     if len(lit) > MOST:
         # Areas are not known, so materials with the most primitives are kept, earlier ones of the file first.
         kept = sorted(sorted(range(len(lit)), key=lambda k: (-lit[k].uses, k))[:MOST])
-        notices.append(f"{scene.path} has {len(lit)} materials that light falls on: drawn are the {MOST} that most of "
-                       "its primitives have, their surface is not known")
+        notices.append(
+            f"{scene.path} has {len(lit)} materials that light falls on: drawn are the {MOST} that most of "
+            "its primitives have, their surface is not known"
+        )
         lit = [lit[k] for k in kept]
     unlit = [m.name for m in scene.materials if m.unlit]
     if unlit:
         notices.append(f"{_some(unlit)}: unlit, no sphere is drawn of it")
-    made = tuple(MaterialSphere(_triple(np.clip(middle(m["base_color"]), 0, 1)), float(middle(m["metalness"])[0]),
-                        float(middle(m["roughness"])[0]), insulator(m), m.name) for m in lit)
+    made = tuple(
+        MaterialSphere(
+            _triple(np.clip(middle(m["base_color"]), 0, 1)),
+            float(middle(m["metalness"])[0]),
+            float(middle(m["roughness"])[0]),
+            insulator(m),
+            m.name,
+        )
+        for m in lit
+    )
     return SphereLayout(made, min(columns, len(made)), notices=(*notices, *_left_out(lit)), scene=str(scene.path))
 
 
-def layout_of(scene: str | os.PathLike[str] | None, columns: int, rows: int | None,
-         base_color: Sequence[float] | None) -> SphereLayout:
+def layout_of(
+    scene: str | os.PathLike[str] | None, columns: int, rows: int | None, base_color: Sequence[float] | None
+) -> SphereLayout:
     """The spheres of a scene's materials, or of a grid where no scene is given.
 
     Raises UsageError for rows or a base colour together with a scene, and the errors of `of_grid`, `of_scene` and
@@ -155,8 +180,11 @@ _KINDS: tuple[tuple[str, Callable[[Material], bool], str], ...] = (
     ("volume", lambda m: m["transmission"].most > 0 and m["thickness"].most > 0, "nothing is refracted or absorbed"),
     ("anisotropy", lambda m: m["anisotropy"].most > 0, "the highlight is round"),
     ("iridescence", lambda m: m["iridescence"].most > 0, "Fresnel's term is that without the film"),
-    ("light of its own", lambda m: m["emission"].most * m["emissive_strength"].most > 0, "only what is reflected is "
-     "drawn"),
+    (
+        "light of its own",
+        lambda m: m["emission"].most * m["emissive_strength"].most > 0,
+        "only what is reflected is drawn",
+    ),
     ("a specular factor below 1", lambda m: m["specular"].least < 1, "F0 is scaled, F90 stays 1"),
 )
 
@@ -171,9 +199,14 @@ def _left_out(lit: Sequence[Material]) -> list[str]:
             found.append(f"{_some([m.name for m in who])}: {what}")
 
     read = [m for m in lit if all(m[name].mean for name in _TEXTURED)]
-    add([m for m in read if any(b - a > EVEN for name in _TEXTURED
-                                for a, b in zip(m[name].low, m[name].high, strict=True))],
-        "textures vary, the sphere has the mean of what is in use")
+    add(
+        [
+            m
+            for m in read
+            if any(b - a > EVEN for name in _TEXTURED for a, b in zip(m[name].low, m[name].high, strict=True))
+        ],
+        "textures vary, the sphere has the mean of what is in use",
+    )
     add([m for m in lit if m not in read], "textures that are not read, the sphere has the middle of what they can be")
     for what, has, instead in _KINDS:
         add([m for m in lit if has(m)], f"{what} is left out, {instead}")

@@ -1,5 +1,6 @@
 """Reads a glTF scene: its materials, with the range of each value through factors and textures, its size and its
 cameras. `needs` decides what follows from them."""
+
 from __future__ import annotations
 
 import math
@@ -65,13 +66,22 @@ PROPERTIES = (
     Property("emissive_strength", _KHR + "emissive_strength", "emissiveStrength", (1.0,), high=math.inf),
     Property("ior", _KHR + "ior", "ior", (1.5,), high=math.inf),
     Property("specular", _KHR + "specular", "specularFactor", (1.0,), "specularTexture", "A"),
-    Property("specular_color", _KHR + "specular", "specularColorFactor", (1.0, 1.0, 1.0), "specularColorTexture", "RGB",
-             srgb=True, high=math.inf),
+    Property(
+        "specular_color",
+        _KHR + "specular",
+        "specularColorFactor",
+        (1.0, 1.0, 1.0),
+        "specularColorTexture",
+        "RGB",
+        srgb=True,
+        high=math.inf,
+    ),
     Property("sheen_color", _KHR + "sheen", "sheenColorFactor", (0.0, 0.0, 0.0), "sheenColorTexture", "RGB", srgb=True),
     Property("sheen_roughness", _KHR + "sheen", "sheenRoughnessFactor", (0.0,), "sheenRoughnessTexture", "A"),
     Property("clearcoat", _KHR + "clearcoat", "clearcoatFactor", (0.0,), "clearcoatTexture", "R"),
-    Property("clearcoat_roughness", _KHR + "clearcoat", "clearcoatRoughnessFactor", (0.0,), "clearcoatRoughnessTexture",
-             "G"),
+    Property(
+        "clearcoat_roughness", _KHR + "clearcoat", "clearcoatRoughnessFactor", (0.0,), "clearcoatRoughnessTexture", "G"
+    ),
     Property("anisotropy", _KHR + "anisotropy", "anisotropyStrength", (0.0,), "anisotropyTexture", "B"),
     Property("transmission", _KHR + "transmission", "transmissionFactor", (0.0,), "transmissionTexture", "R"),
     Property("thickness", _KHR + "volume", "thicknessFactor", (0.0,), "thicknessTexture", "G", high=math.inf),
@@ -79,10 +89,23 @@ PROPERTIES = (
     Property("attenuation_color", _KHR + "volume", "attenuationColor", (1.0, 1.0, 1.0)),
     Property("iridescence", _KHR + "iridescence", "iridescenceFactor", (0.0,), "iridescenceTexture", "R"),
     Property("iridescence_ior", _KHR + "iridescence", "iridescenceIor", (1.3,), low=1.0, high=math.inf),
-    Property("diffuse_transmission", _KHR + "diffuse_transmission", "diffuseTransmissionFactor", (0.0,),
-             "diffuseTransmissionTexture", "A"),
-    Property("diffuse_transmission_color", _KHR + "diffuse_transmission", "diffuseTransmissionColorFactor",
-             (1.0, 1.0, 1.0), "diffuseTransmissionColorTexture", "RGB", srgb=True),
+    Property(
+        "diffuse_transmission",
+        _KHR + "diffuse_transmission",
+        "diffuseTransmissionFactor",
+        (0.0,),
+        "diffuseTransmissionTexture",
+        "A",
+    ),
+    Property(
+        "diffuse_transmission_color",
+        _KHR + "diffuse_transmission",
+        "diffuseTransmissionColorFactor",
+        (1.0, 1.0, 1.0),
+        "diffuseTransmissionColorTexture",
+        "RGB",
+        srgb=True,
+    ),
     Property("dispersion", _KHR + "dispersion", "dispersion", (0.0,), high=math.inf),
 )
 """Every value that is read, in the order of the extensions' specifications."""
@@ -127,8 +150,11 @@ class Spread:
         """(low, high, share) of each part of the range in use, cut to its ends; for a property of one channel."""
         if not self.histogram:
             return ((self.least, self.most, 1.0),)
-        return tuple((max(k / BINS, self.least), min((k + 1) / BINS, self.most), share)
-                     for k, share in enumerate(self.histogram) if share > 0)
+        return tuple(
+            (max(k / BINS, self.least), min((k + 1) / BINS, self.most), share)
+            for k, share in enumerate(self.histogram)
+            if share > 0
+        )
 
 
 @dataclass(frozen=True)
@@ -217,10 +243,22 @@ def library() -> Any:
 
 
 # Extensions that a file may require: they are read, or they change neither materials nor extent.
-_ALLOWED = KNOWN | {"KHR_texture_transform", "KHR_lights_punctual", "KHR_mesh_quantization", "KHR_materials_variants",
-                    "EXT_mesh_gpu_instancing", "KHR_draco_mesh_compression", "EXT_meshopt_compression",
-                    "KHR_texture_basisu", "EXT_texture_webp", "KHR_animation_pointer", "KHR_node_visibility",
-                    "EXT_lights_image_based", "KHR_xmp_json_ld", _KHR + "pbrSpecularGlossiness"}
+_ALLOWED = KNOWN | {
+    "KHR_texture_transform",
+    "KHR_lights_punctual",
+    "KHR_mesh_quantization",
+    "KHR_materials_variants",
+    "EXT_mesh_gpu_instancing",
+    "KHR_draco_mesh_compression",
+    "EXT_meshopt_compression",
+    "KHR_texture_basisu",
+    "EXT_texture_webp",
+    "KHR_animation_pointer",
+    "KHR_node_visibility",
+    "EXT_lights_image_based",
+    "KHR_xmp_json_ld",
+    _KHR + "pbrSpecularGlossiness",
+}
 
 
 @dataclass
@@ -245,8 +283,10 @@ class _Reading:
         required = self.take.array(gltf.document.get("extensionsRequired", []), "extensionsRequired", 0, 256)
         for name in required:
             if self.take.text(name, "an entry of extensionsRequired") not in _ALLOWED:
-                raise UnsupportedError(f"{gltf.path} requires {name[:60]}, which is not read"
-                                       f"{nearest(name[:60], _ALLOWED) if len(name) < 60 else ''}")
+                raise UnsupportedError(
+                    f"{gltf.path} requires {name[:60]}, which is not read"
+                    f"{nearest(name[:60], _ALLOWED) if len(name) < 60 else ''}"
+                )
 
     def wrong(self, what: str) -> InputError:
         return self.gltf.source.wrong(what)
@@ -285,8 +325,15 @@ class _Reading:
             raise self.wrong("its extent is not finite")
         there = bool(np.all(low <= high))
         materials = self._materials(used)
-        return Scene(self.gltf.path, materials, _three(low) if there else None, _three(high) if there else None,
-                     tuple(seen), lights, tuple(self.notices))
+        return Scene(
+            self.gltf.path,
+            materials,
+            _three(low) if there else None,
+            _three(high) if there else None,
+            tuple(seen),
+            lights,
+            tuple(self.notices),
+        )
 
     def _order(self, nodes: Sequence[dict[str, Any]]) -> list[tuple[int, np.ndarray]]:
         """The nodes of the scene with their transforms to the world, (4, 4)."""
@@ -297,8 +344,11 @@ class _Reading:
             children.append([self.gltf.index(c, len(nodes), f"a child of node {k}") for c in found])
             for c in children[-1]:
                 if parent[c] >= 0:
-                    raise self.wrong(f"node {c} is a child of both node {parent[c]} and node {k}" if parent[c] != k
-                                     else f"node {c} is twice a child of node {k}")
+                    raise self.wrong(
+                        f"node {c} is a child of both node {parent[c]} and node {k}"
+                        if parent[c] != k
+                        else f"node {c} is twice a child of node {k}"
+                    )
                 parent[c] = k
         mark = [0] * len(nodes)  # 1 + the node from which it was first passed on the way up
         for k in range(len(nodes)):
@@ -340,9 +390,13 @@ class _Reading:
             return None
         x, y, z, w = self._numbers(node.get("rotation", [0, 0, 0, 1]), f"rotation of node {k}", 4)
         n = 2 / max(x * x + y * y + z * z + w * w, 1e-30)  # of a unit quaternion 2: exporters round
-        turn = np.array([[1 - n * (y * y + z * z), n * (x * y - z * w), n * (x * z + y * w)],
-                         [n * (x * y + z * w), 1 - n * (x * x + z * z), n * (y * z - x * w)],
-                         [n * (x * z - y * w), n * (y * z + x * w), 1 - n * (x * x + y * y)]])
+        turn = np.array(
+            [
+                [1 - n * (y * y + z * z), n * (x * y - z * w), n * (x * z + y * w)],
+                [n * (x * y + z * w), 1 - n * (x * x + z * z), n * (y * z - x * w)],
+                [n * (x * z - y * w), n * (y * z + x * w), 1 - n * (x * x + y * y)],
+            ]
+        )
         made = np.eye(4)
         with np.errstate(over="ignore", invalid="ignore"):
             made[:3, :3] = turn * self._numbers(node.get("scale", [1, 1, 1]), f"scale of node {k}", 3)
@@ -359,8 +413,13 @@ class _Reading:
             raise self.wrong(f"yfov of camera {k} is {value:g}, it must be in (0, π)")
         ahead = -world[:3, 2]
         length = float(np.sqrt((ahead * ahead).sum()))
-        return Camera(self._name(one, f"camera {k}"), _three(world[:3, 3]), _three(ahead / length if length else ahead),
-                      value if kind == "perspective" else None, None if kind == "perspective" else 2 * abs(value))
+        return Camera(
+            self._name(one, f"camera {k}"),
+            _three(world[:3, 3]),
+            _three(ahead / length if length else ahead),
+            value if kind == "perspective" else None,
+            None if kind == "perspective" else 2 * abs(value),
+        )
 
     def _name(self, one: dict[str, Any], what: str) -> str:
         text = self.take.text(one.get("name", ""), f"the name of {what}")
@@ -368,20 +427,24 @@ class _Reading:
 
     # ------------------------------------------------------------------------------------------- meshes
 
-    def _mesh(self, mesh: dict[str, Any], m: int,
-              used: dict[int, list[dict[str, Any]]]) -> tuple[np.ndarray, np.ndarray] | None:
+    def _mesh(
+        self, mesh: dict[str, Any], m: int, used: dict[int, list[dict[str, Any]]]
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """The box of a mesh, None where it has no positions; notes its primitives under their materials."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        for p, primitive in enumerate(self.take.array(mesh.get("primitives"), f"primitives of mesh {m}", 1,
-                                                      MAX_PRIMITIVES)):
+        for p, primitive in enumerate(
+            self.take.array(mesh.get("primitives"), f"primitives of mesh {m}", 1, MAX_PRIMITIVES)
+        ):
             what = f"primitive {p} of mesh {m}"
             one = self.take.object(primitive, what)
             attributes = self.take.object(one.get("attributes"), f"attributes of {what}")
             extensions = self.take.object(one.get("extensions", {}), f"extensions of {what}")
             numbers = [one["material"]] if "material" in one else []
             variants = self.take.object(extensions.get(_KHR + "variants", {}), f"variants of {what}")
-            numbers += [self.take.object(v, f"a variant of {what}").get("material") for v in
-                        self.take.array(variants.get("mappings", []), f"mappings of {what}", 0, 1 << 12)]
+            numbers += [
+                self.take.object(v, f"a variant of {what}").get("material")
+                for v in self.take.array(variants.get("mappings", []), f"mappings of {what}", 0, 1 << 12)
+            ]
             of = [self.gltf.index(k, len(self.raw), f"the material of {what}") for k in numbers]
             for k in dict.fromkeys(of or [-1]):
                 used.setdefault(k, []).append({**one, "what": what})
@@ -427,8 +490,9 @@ class _Reading:
 
     def _typed(self) -> Any:
         """Materials, textures, images and samplers as pygltflib's objects."""
-        document = {name: self.gltf.objects(name, MAX_MATERIALS) for name in ("materials", "textures", "images",
-                                                                              "samplers")}
+        document = {
+            name: self.gltf.objects(name, MAX_MATERIALS) for name in ("materials", "textures", "images", "samplers")
+        }
         document["images"] = [{} for _ in document["images"]]  # their data stay where they are
         try:
             with warnings.catch_warnings():
@@ -465,8 +529,9 @@ class _Reading:
         if p.name == "ior" and 0 < found[0] < 1:
             raise self.wrong(f"ior of {what} is {found[0]:g}; 0 and 1 or more are allowed")
         if np.any(found < p.low - ROUNDING) or np.any(found > p.high + ROUNDING):
-            raise self.wrong(f"{p.factor} of {what} is {', '.join(f'{x:g}' for x in found)}, outside "
-                             f"[{p.low:g}, {p.high:g}]")
+            raise self.wrong(
+                f"{p.factor} of {what} is {', '.join(f'{x:g}' for x in found)}, outside [{p.low:g}, {p.high:g}]"
+            )
         if p.name == "attenuation_distance" and found[0] <= 0:
             raise self.wrong(f"attenuationDistance of {what} is {found[0]:g}, it must be over 0")
         return np.clip(found, p.low, p.high), "default" if np.array_equal(found, p.default) else "factor"
@@ -485,14 +550,17 @@ class _Reading:
         """Of the iridescent film, in nm: from minimum to maximum by the texture's G, the maximum without one."""
         name = _KHR + "iridescence"
         holder, what = self._holder(k, name)
-        ends = [self._factor(holder, Property("", name, f"iridescenceThickness{end}", (usual,), high=math.inf), what)
-                for end, usual in (("Minimum", 100.0), ("Maximum", 400.0))]
+        ends = [
+            self._factor(holder, Property("", name, f"iridescenceThickness{end}", (usual,), high=math.inf), what)
+            for end, usual in (("Minimum", 100.0), ("Maximum", 400.0))
+        ]
         texture = self._texture(holder, "iridescenceThicknessTexture", what, primitives)
         if texture is None:
             value = (float(ends[1][0][0]),)
             return lambda: Spread(value, value, value, ends[1][1])
-        return lambda: _spread(texture, Property("", name, "", (0.0,), "", "G", high=math.inf), ends[0][0],
-                               ends[1][0] - ends[0][0])
+        return lambda: _spread(
+            texture, Property("", name, "", (0.0,), "", "G", high=math.inf), ends[0][0], ends[1][0] - ends[0][0]
+        )
 
     def _texture(self, holder: Any, name: str, what: str, primitives: Sequence[dict[str, Any]]) -> _Use | None:
         """What of which image a property is multiplied with; None for no texture."""
@@ -513,8 +581,10 @@ class _Reading:
         if "EXT_texture_webp" in own:
             source = self.take.object(own["EXT_texture_webp"], f"EXT_texture_webp of {where}").get("source", source)
         if source is None:
-            self.notices[f"{where} is of a kind that is not decoded ({', '.join(own) or 'it has no source'}): all from "
-                         "0 to its factor is assumed"] = None
+            self.notices[
+                f"{where} is of a kind that is not decoded ({', '.join(own) or 'it has no source'}): all from "
+                "0 to its factor is assumed"
+            ] = None
             return _Use(None)
         image = self.gltf.index(source, len(self.typed.images), f"the image of {where}")
         coordinates = self.take.whole(0 if coordinates is None else coordinates, f"texCoord of {where}", 0, 64)
@@ -524,8 +594,9 @@ class _Reading:
             coordinates = self.take.whole(transform["texCoord"], f"texCoord of {where}", 0, 64)
         wraps = (10497, 10497)
         if texture.sampler is not None:
-            sampler = self.typed.samplers[self.gltf.index(texture.sampler, len(self.typed.samplers),
-                                                          f"the sampler of {where}")]
+            sampler = self.typed.samplers[
+                self.gltf.index(texture.sampler, len(self.typed.samplers), f"the sampler of {where}")
+            ]
             wraps = (sampler.wrapS or 10497, sampler.wrapT or 10497)
         key = (coordinates, moved.tobytes(), wraps, id(primitives))
         uses = self.uses.setdefault(image, {})
@@ -541,8 +612,9 @@ class _Reading:
         c, s = math.cos(turn), math.sin(turn)
         return np.array([[a * c, b * s, x], [-a * s, b * c, y]])
 
-    def _boxes(self, primitives: Sequence[dict[str, Any]], coordinates: int, moved: np.ndarray,
-               wraps: tuple[int, int]) -> np.ndarray | None:
+    def _boxes(
+        self, primitives: Sequence[dict[str, Any]], coordinates: int, moved: np.ndarray, wraps: tuple[int, int]
+    ) -> np.ndarray | None:
         """(n, 4) boxes around the triangles of primitives on an image, None where that is all of it or not known."""
         found = []
         for one in primitives:
@@ -563,15 +635,16 @@ class _Reading:
                 if corners.dtype.kind != "u":
                     raise self.wrong(f"indices of {one['what']} are not unsigned integers")
                 if (most := int(corners.max())) >= count:
-                    raise self.wrong(f"indices of {one['what']} go up to {most}, its {count} texture coordinates to "
-                                     f"{count - 1}")
+                    raise self.wrong(
+                        f"indices of {one['what']} go up to {most}, its {count} texture coordinates to {count - 1}"
+                    )
             number_of = count if corners is None else len(corners)
             self.indices += number_of
             if self.indices > MAX_INDICES:
                 return None
             placed = uv.astype(np.float64) @ moved[:, :2].T + moved[:, 2]
             placed = placed if corners is None else placed[corners[:, 0]]
-            found.append(_around(placed[:number_of // 3 * 3].reshape(-1, 3, 2), wraps))
+            found.append(_around(placed[: number_of // 3 * 3].reshape(-1, 3, 2), wraps))
         boxes = np.concatenate(found) if found else np.empty((0, 4))
         if not len(boxes) or np.any(np.all(boxes == [0, 0, 1, 1], axis=1)):
             return None
@@ -582,8 +655,14 @@ class _Reading:
             return Material("(glTF's default)", {name: value() for name, value in values.items()}, (), uses)
         name = self._name(self.raw[k], f"material {k}")
         given = tuple(self.take.object(self.raw[k].get("extensions", {}), f"extensions of material {k}"))
-        return Material(name, {p: value() for p, value in values.items()}, given, uses, UNLIT in given,
-                        tuple(e for e in given if e not in KNOWN))
+        return Material(
+            name,
+            {p: value() for p, value in values.items()},
+            given,
+            uses,
+            UNLIT in given,
+            tuple(e for e in given if e not in KNOWN),
+        )
 
 
 def _three(values: Iterable[float]) -> tuple[float, float, float]:
@@ -644,8 +723,9 @@ def _spread(use: _Use, p: Property, base: np.ndarray, factor: np.ndarray) -> Spr
         ends = np.sort(np.stack([base, base + factor]), axis=0)
         return Spread(tuple(ends[0].tolist()), tuple(ends[1].tolist()), (), "texture", seen=False)
     codes = use.counts.shape[1]
-    decoded = srgb_table(f"uint{8 if codes == 256 else 16}").astype(np.float64) if p.srgb else \
-        np.arange(codes) / (codes - 1)
+    decoded = (
+        srgb_table(f"uint{8 if codes == 256 else 16}").astype(np.float64) if p.srgb else np.arange(codes) / (codes - 1)
+    )
     low, high, mean = [], [], []
     for channel, b, f in zip(p.channels, base, factor, strict=True):
         counts = use.counts["RGBA".index(channel)]

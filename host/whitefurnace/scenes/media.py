@@ -1,5 +1,6 @@
 """Judges the media inside a scene's materials: the size that light crosses, the length that a pixel covers, and the
 table of pre-integrated diffusion that is needed where local diffuse is wrong."""
+
 from __future__ import annotations
 
 import math
@@ -20,9 +21,18 @@ TABLE = 64
 ROWS = 16384
 """Largest height of an image that --resolution takes."""
 
-_NAMES = {"σa": "absorption", "sigma_a": "absorption", "absorption": "absorption", "σs": "scattering",
-          "sigma_s": "scattering", "scattering": "scattering", "g": "g", "ior": "ior", "distance": "distance",
-          "color": "color"}
+_NAMES = {
+    "σa": "absorption",
+    "sigma_a": "absorption",
+    "absorption": "absorption",
+    "σs": "scattering",
+    "sigma_s": "scattering",
+    "scattering": "scattering",
+    "g": "g",
+    "ior": "ior",
+    "distance": "distance",
+    "color": "color",
+}
 
 
 @dataclass(frozen=True)
@@ -54,8 +64,10 @@ class Inside:
         said = [*(self.judgement.sentences if self.judgement else ()), *([self.reason] if self.reason else [])]
         if self.table is not None:
             numbers = "".join(f" --set {one}" for one in self.table.get("set", ()))
-            said.append(f"lut diffusion -o {self.table['output']} --size {self.table['size']} --scheme "
-                        f"{self.table['scheme']}{numbers}")
+            said.append(
+                f"lut diffusion -o {self.table['output']} --size {self.table['size']} --scheme "
+                f"{self.table['scheme']}{numbers}"
+            )
         return tuple(said)
 
 
@@ -101,8 +113,10 @@ def _numbers(text: str, rest: str, own: Material | None) -> Medium:
     for part in rest.split(","):
         name, equals, value = part.partition("=")
         if not equals or name.strip() not in _NAMES:
-            raise UsageError(f"--medium {text}: {part.strip()!r} is not one of {', '.join(dict.fromkeys(_NAMES))} with "
-                             f"its value{nearest(name.strip(), _NAMES)}")
+            raise UsageError(
+                f"--medium {text}: {part.strip()!r} is not one of {', '.join(dict.fromkeys(_NAMES))} with "
+                f"its value{nearest(name.strip(), _NAMES)}"
+            )
         if _NAMES[name.strip()] in given:
             raise UsageError(f"--medium {text}: {name.strip()} is there twice")
         given[_NAMES[name.strip()]] = value.strip()
@@ -192,8 +206,10 @@ def inside(scene: Scene, pixel: Pixel | None, media: dict[str, Medium]) -> tuple
     if "" in media:
         found.append(_judged(scene, pixel, None, media[""]))
     taken: set[str] = set()
-    return tuple(one if one.table is None else replace(one, table={**one.table, "output": _file(one.material, taken)})
-                 for one in found)
+    return tuple(
+        one if one.table is None else replace(one, table={**one.table, "output": _file(one.material, taken)})
+        for one in found
+    )
 
 
 def _of(scene: Scene, pixel: Pixel | None, m: Material, given: Medium | None) -> Inside:
@@ -215,8 +231,12 @@ def _judged(scene: Scene, pixel: Pixel | None, m: Material | None, medium: Mediu
         return Inside(name, judgement, size_of, "no table of diffusion: a channel of it does not scatter")
     # `lut diffusion` has no schemes for air and water; a medium given by numbers is a dipole.
     own = MEDIA.get(medium.name) == medium and medium.name not in ("air", "water")
-    table: dict[str, Any] = {"kind": "diffusion", "output": "", "size": TABLE,
-                             "scheme": medium.name if own else "dipole"}
+    table: dict[str, Any] = {
+        "kind": "diffusion",
+        "output": "",
+        "size": TABLE,
+        "scheme": medium.name if own else "dipole",
+    }
     if not own:
         # The dipole depends only on σs(1 - g), so g = 0 with the reduced scattering is the same and in `lut`'s range.
         r, g, b = medium.reduced.tolist()

@@ -4,6 +4,7 @@ leaves farther than a pixel from where it entered. Diffuse light is subsurface s
 
 Lengths are in metres and coefficients per metre; three numbers are RGB.
 """
+
 from __future__ import annotations
 
 import math
@@ -19,8 +20,19 @@ from whitefurnace.errors import UsageError, nearest
 
 Triple = tuple[float, float, float]
 
-UNITS = {"nm": 1e-9, "um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3, "in": 0.0254, "ft": 0.3048,
-         "yd": 0.9144, "mi": 1609.344}
+UNITS = {
+    "nm": 1e-9,
+    "um": 1e-6,
+    "µm": 1e-6,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+    "yd": 0.9144,
+    "mi": 1609.344,
+}
 
 NOTICEABLE = 2.3
 """Smallest ΔE*ab between two colours that people notice [Mahy1994]. A grey has it where 6 % of the light is lost."""
@@ -37,8 +49,9 @@ FAINT = 0.01
 
 COLOURS = ("red", "green", "blue")
 
-_XYZ = np.array([[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750],
-                 [0.0193339, 0.1191920, 0.9503041]])
+_XYZ = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+)
 """Matrix from linear Rec.709 to CIE XYZ, D65."""
 
 
@@ -59,8 +72,9 @@ def length(text: str) -> float:
     return value * UNITS[match[2]]
 
 
-def footprint(height: int, *, yfov: float | None = None, distance: float | None = None,
-              ymag: float | None = None) -> float:
+def footprint(
+    height: int, *, yfov: float | None = None, distance: float | None = None, ymag: float | None = None
+) -> float:
     """Metres that a pixel of an image covers, for a camera as glTF has them.
 
     height: of the image in pixels. yfov, distance: vertical angle in radians of a perspective camera, and metres to the
@@ -92,8 +106,11 @@ def length_text(metres: float) -> str:
         return "any distance"
     for unit in ("km", "m", "mm", "µm"):
         if metres >= UNITS[unit]:
-            return f"{metres / UNITS[unit]:.2g} {unit}" if metres < 100 * UNITS[unit] else \
-                f"{metres / UNITS[unit]:.0f} {unit}"
+            return (
+                f"{metres / UNITS[unit]:.2g} {unit}"
+                if metres < 100 * UNITS[unit]
+                else f"{metres / UNITS[unit]:.0f} {unit}"
+            )
     return f"{metres * 1e9:.2g} nm"
 
 
@@ -131,8 +148,16 @@ class Medium:
             raise UsageError(f"ior {self.ior:g} is outside [1, 3]")
 
     @classmethod
-    def of_volume(cls, attenuation_distance: float | None = None, attenuation_color: Sequence[float] = (1, 1, 1), *,
-                  scattering: Triple = (0.0, 0.0, 0.0), g: float = 0.0, ior: float = 1.5, name: str = "") -> Medium:
+    def of_volume(
+        cls,
+        attenuation_distance: float | None = None,
+        attenuation_color: Sequence[float] = (1, 1, 1),
+        *,
+        scattering: Triple = (0.0, 0.0, 0.0),
+        g: float = 0.0,
+        ior: float = 1.5,
+        name: str = "",
+    ) -> Medium:
         """The medium of glTF's KHR_materials_volume, σa = -ln(colour)/distance.
 
         attenuation_distance: metres after which white light has the colour `attenuation_color`; None or infinity for no
@@ -144,8 +169,14 @@ class Medium:
             raise UsageError(f"attenuation distance {attenuation_distance:g} is not above 0")
         if len(attenuation_color) != 3 or not all(0 <= c <= 1 for c in attenuation_color):
             raise UsageError(f"attenuation colour {tuple(attenuation_color)} is not three numbers from 0 to 1")
-        sigma = tuple(0.0 if math.isinf(attenuation_distance) or c == 1 else
-                      -math.log(c) / attenuation_distance if c > 0 else math.inf for c in attenuation_color)
+        sigma = tuple(
+            0.0
+            if math.isinf(attenuation_distance) or c == 1
+            else -math.log(c) / attenuation_distance
+            if c > 0
+            else math.inf
+            for c in attenuation_color
+        )
         return cls(sigma, scattering, g, ior, name)  # type: ignore[arg-type]
 
     @property
@@ -195,8 +226,11 @@ class Medium:
 
     def parameters(self) -> dict[str, float]:
         """The medium's parameters for `lut diffusion --scheme dipole`, per mm."""
-        given = {f"{name}_{c}": value * 1e-3 for name in ("absorption", "scattering")
-                 for c, value in zip("rgb", getattr(self, name), strict=True)}
+        given = {
+            f"{name}_{c}": value * 1e-3
+            for name in ("absorption", "scattering")
+            for c, value in zip("rgb", getattr(self, name), strict=True)
+        }
         return {**given, "g": self.g, "ior": self.ior}
 
 
@@ -212,8 +246,10 @@ def _inverse(values: np.ndarray) -> np.ndarray:
 MEDIA: Mapping[str, Medium] = {
     "water": Medium(_triple(1e3 * np.array(WATER)), ior=1.333, name="water"),
     "air": Medium((0.0, 0.0, 0.0), _triple(1e3 * np.array(AIR)), ior=1.0, name="air"),
-    **{name: Medium(_triple(1e3 * np.array(a)), _triple(1e3 * np.array(s)), ior=ior, name=name)
-       for name, (s, a, ior) in JENSEN.items()},
+    **{
+        name: Medium(_triple(1e3 * np.array(a)), _triple(1e3 * np.array(s)), ior=ior, name=name)
+        for name, (s, a, ior) in JENSEN.items()
+    },
 }
 """Measured media: water [PopeFry1997], air [Bruneton2008], and those of [Jensen2001], whose scattering is reduced."""
 
@@ -308,8 +344,13 @@ def judge(medium: Medium, size: float | None = None, pixel: float | None = None)
     for name, value in (("size", size), ("pixel", pixel)):
         if value is not None:
             _positive(name, value)
-    return Judgement(medium, size, pixel, None if size is None else _absorbed(medium, size),
-                     None if pixel is None else _left(medium, size, pixel))
+    return Judgement(
+        medium,
+        size,
+        pixel,
+        None if size is None else _absorbed(medium, size),
+        None if pixel is None else _left(medium, size, pixel),
+    )
 
 
 def difference(colour: Sequence[float] | np.ndarray) -> float:
@@ -330,15 +371,18 @@ def _absorbed(medium: Medium, size: float) -> Absorption:
     off = difference(through)
     half = _triple(math.log(2) * _inverse(np.array(medium.absorption)))
     least = int(np.argmin(through))
-    which = f"{_percent(through[least])} of the {COLOURS[least]} light is left after {length_text(size)}, ΔE*ab " + \
-        (f"{off:.0f}" if off >= 10 else f"{off:.1f}")
+    which = f"{_percent(through[least])} of the {COLOURS[least]} light is left after {length_text(size)}, ΔE*ab " + (
+        f"{off:.0f}" if off >= 10 else f"{off:.1f}"
+    )
     if not any(medium.absorption):
         verdict, reason = "negligible", "nothing is absorbed"
     elif off < NOTICEABLE:
         verdict, reason = "negligible", f"absorption is not noticed: {which}, of the {NOTICEABLE} that are"
     elif through.max() < BLACK:
-        verdict, reason = "opaque", ("nothing comes through: less than code 1 of 8-bit sRGB is left after "
-                                     f"{length_text(size)}")
+        verdict, reason = (
+            "opaque",
+            (f"nothing comes through: less than code 1 of 8-bit sRGB is left after {length_text(size)}"),
+        )
     else:
         verdict, reason = "matters", f"absorption matters: {which}, where {NOTICEABLE} are noticed"
     return Absorption(verdict, _triple(through), off, half, reason)
@@ -351,31 +395,49 @@ def _left(medium: Medium, size: float | None, pixel: float) -> Transport:
     widest = float(spread[farthest])
 
     def say(verdict: str, reason: str) -> Transport:
-        return Transport(verdict, medium.mean_free_path, medium.diffusion_length, medium.albedo, medium.spread, share,
-                         reason)
+        return Transport(
+            verdict, medium.mean_free_path, medium.diffusion_length, medium.albedo, medium.spread, share, reason
+        )
 
     # The share of light that goes straight on decides between Hoffman's "clear" and "cloudy".
     straight = None if size is None else np.exp(-np.array(medium.scattering) * size)
     if not any(medium.scattering):
         return say("clear", "nothing scatters inside: light is refracted and absorbed, none is diffuse")
     if not counted.any():
-        return say("clear", "what scatters inside is absorbed there: light is refracted and absorbed, and less than "
-                            f"{_percent(FAINT)} is diffuse")
+        return say(
+            "clear",
+            "what scatters inside is absorbed there: light is refracted and absorbed, and less than "
+            f"{_percent(FAINT)} is diffuse",
+        )
     if size is not None and straight is not None:
         if difference(straight) < NOTICEABLE:
-            return say("clear", f"scattering is not noticed: {_percent(straight.min())} of the light or more goes "
-                                f"straight on over {length_text(size)}")
+            return say(
+                "clear",
+                f"scattering is not noticed: {_percent(straight.min())} of the light or more goes "
+                f"straight on over {length_text(size)}",
+            )
         if medium.reduced.max() * size < 1:
             turned = length_text(1 / medium.reduced.max())
-            return say("cloudy", f"a volume, neither diffuse nor clear: light goes {turned} "
-                                 f"before it has turned, farther than the {length_text(size)} of the object")
+            return say(
+                "cloudy",
+                f"a volume, neither diffuse nor clear: light goes {turned} "
+                f"before it has turned, farther than the {length_text(size)} of the object",
+            )
     colour = COLOURS[farthest]
     if widest <= pixel:
-        return say("local", f"local diffuse is right: {_percent(SHARE)} of the {colour} light leaves within "
-                            f"{length_text(widest)} of where it entered, and a pixel is {length_text(pixel)}")
-    reach = (f"{_percent(share[farthest])} of the {colour} light leaves farther than a pixel of {length_text(pixel)} "
-             f"from where it entered, and {_percent(SHARE)} within {length_text(widest)}")
+        return say(
+            "local",
+            f"local diffuse is right: {_percent(SHARE)} of the {colour} light leaves within "
+            f"{length_text(widest)} of where it entered, and a pixel is {length_text(pixel)}",
+        )
+    reach = (
+        f"{_percent(share[farthest])} of the {colour} light leaves farther than a pixel of {length_text(pixel)} "
+        f"from where it entered, and {_percent(SHARE)} within {length_text(widest)}"
+    )
     if size is not None and widest > size:
-        return say("translucent", f"subsurface scattering is needed, and light comes through: {reach}, where the "
-                                  f"object is {length_text(size)}")
+        return say(
+            "translucent",
+            f"subsurface scattering is needed, and light comes through: {reach}, where the "
+            f"object is {length_text(size)}",
+        )
     return say("subsurface", f"subsurface scattering is needed: {reach}")

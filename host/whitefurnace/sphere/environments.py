@@ -62,12 +62,8 @@ class Layout(NamedTuple):
 # sphere: +Z is in the middle with +Y above it. In a vertical cross -Z hangs below -Y, upside down.
 LAYOUTS = (
     Layout("latlong", 2, 1),
-    Layout(
-        "horizontal cross", 4, 3, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(3, 1))
-    ),
-    Layout(
-        "vertical cross", 3, 4, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(1, 3, 2))
-    ),
+    Layout("horizontal cross", 4, 3, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(3, 1))),
+    Layout("vertical cross", 3, 4, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(1, 3, 2))),
     Layout("horizontal strip", 6, 1, tuple(Cell(face, 0) for face in range(6))),
     Layout("vertical strip", 1, 6, tuple(Cell(0, face) for face in range(6))),
 )
@@ -254,8 +250,10 @@ _FRESH = 2_000_000_000  # ns: the coarsest times that file systems keep (FAT), a
 def _stamps(path: Path) -> tuple[tuple[int, ...], ...] | None:
     """What changes when the files of a path are written to; None where they cannot be listed, as reading will say."""
     try:
-        return tuple((s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
-                     for s in (os.stat(file) for file in source_files(path)))
+        return tuple(
+            (s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
+            for s in (os.stat(file) for file in source_files(path))
+        )
     except (OSError, ValueError, FileError, InputError):
         return None
 
@@ -305,8 +303,7 @@ def _from_array(array: npt.NDArray[Any], zero: bool) -> Environment:
         array = array[..., None]
     if array.ndim != (4 if cube else 3) or array.shape[-1] not in (1, 3, 4) or array.size == 0:
         raise InputError(
-            f"{where} is not an environment; (h, w), (h, w, 1 | 3 | 4), (6, n, n) or "
-            "(6, n, n, 1 | 3 | 4) was expected"
+            f"{where} is not an environment; (h, w), (h, w, 1 | 3 | 4), (6, n, n) or (6, n, n, 1 | 3 | 4) was expected"
         )
     with np.errstate(over="ignore"):  # a double over the range of float32 is found as inf
         pixels = decode_srgb(array) if array.dtype.kind == "u" else np.array(array, np.float32, order="C")
@@ -366,9 +363,7 @@ def _face_paths(folder: Path) -> list[Path]:
     for name in names:
         if len(by_stem[name]) > 1:
             both = " and ".join(path.name for path in by_stem[name])
-            raise InputError(
-                f"{folder} holds the cube face {name} more than once ({both}), one file was expected"
-            )
+            raise InputError(f"{folder} holds the cube face {name} more than once ({both}), one file was expected")
     return [by_stem[name][0] for name in names]
 
 
@@ -405,13 +400,12 @@ def faces_of(pixels: npt.NDArray[np.float32]) -> tuple[str, npt.NDArray[np.float
     if not layout.cells:
         return layout.name, pixels
     height, width, _ = pixels.shape
-    return layout.name, np.stack([np.rot90(pixels[rows, columns], turns)
-                                  for rows, columns, turns in _cells(layout, height, width)])
+    return layout.name, np.stack(
+        [np.rot90(pixels[rows, columns], turns) for rows, columns, turns in _cells(layout, height, width)]
+    )
 
 
-def _placed(
-    pixels: npt.NDArray[np.float32], layout: Layout, name: str, digest: str, notices: list[str]
-) -> Environment:
+def _placed(pixels: npt.NDArray[np.float32], layout: Layout, name: str, digest: str, notices: list[str]) -> Environment:
     if layout.cells:
         found = faces_of(pixels)
         assert found is not None
@@ -419,9 +413,7 @@ def _placed(
     return _made("latlong", pixels, name, layout.name, digest, notices)
 
 
-def _cube(
-    faces: npt.NDArray[np.float32], name: str, layout: str, digest: str, notices: list[str]
-) -> Environment:
+def _cube(faces: npt.NDArray[np.float32], name: str, layout: str, digest: str, notices: list[str]) -> Environment:
     return _made("cube", faces, name, layout, digest, notices)
 
 
@@ -447,9 +439,7 @@ def _made(
     return Environment(kind, texels, coverage, 0.0, name, layout, digest, notices=tuple(notices))
 
 
-def _clean(
-    faces: npt.NDArray[np.float32], layout: Layout | None, where: str, zero: bool, notices: list[str]
-) -> None:
+def _clean(faces: npt.NDArray[np.float32], layout: Layout | None, where: str, zero: bool, notices: list[str]) -> None:
     """Refuse values that are NaN, inf or negative in `faces` (1 or 6, h, w, c), or make them 0 in place. What
     no face of the layout covers does not count."""
     if faces.min() >= 0 and faces.max() <= _FLOAT_MAX:  # false where there is a NaN

@@ -2,6 +2,7 @@
 
 Float64 throughout. `kernels/sphere.clh` has the same geometry for a device.
 """
+
 from __future__ import annotations
 
 import math
@@ -133,7 +134,7 @@ def turned_cube(texels: np.ndarray, matrix: Any) -> np.ndarray:
             columns, rows = right @ DOWN[:, there], down @ RIGHT[:, there]
         else:
             columns, rows = right @ RIGHT[:, there], down @ DOWN[:, there]
-        faces.append(image[::int(rows), ::int(columns)])
+        faces.append(image[:: int(rows), :: int(columns)])
     return np.ascontiguousarray(np.stack(faces))
 
 
@@ -212,13 +213,13 @@ def octahedral_means(env: Environment, shape: Shape, index: np.ndarray, lattice:
     out = np.empty((len(index), 3))
     step = max(1, (1 << 20) // count)
     for first in range(0, len(index), step):
-        part = index[first:first + step]
+        part = index[first : first + step]
         u = ((2 * (part % shape.size) + 1)[:, None] + a) / shape.size - 1
         v = ((2 * (part // shape.size) + 1)[:, None] + b) / shape.size - 1
         d = to_direction(u.ravel(), v.ravel())
         weight = octahedral_density(d).reshape(u.shape)
         lit = radiance_at(env, d).reshape(*u.shape, 3)
-        out[first:first + step] = np.einsum("mk,mkc->mc", weight, lit) / weight.sum(1)[:, None]
+        out[first : first + step] = np.einsum("mk,mkc->mc", weight, lit) / weight.sum(1)[:, None]
     return out
 
 
@@ -258,8 +259,9 @@ def composite(cuts: int) -> tuple[np.ndarray, np.ndarray]:
     return nodes.ravel(), np.tile(w / cells, cells)
 
 
-def latlong_tables(rows: int, columns: int, x: np.ndarray, w: np.ndarray, rotation: float,
-                   scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def latlong_tables(
+    rows: int, columns: int, x: np.ndarray, w: np.ndarray, rotation: float, scale: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the quadrature tables of a lat-long image, by refined row and by refined column.
 
     rows, columns: those of the image. x, w: nodes and weights on [0, 1] within a texel. rotation: radians.
@@ -276,12 +278,15 @@ def latlong_tables(rows: int, columns: int, x: np.ndarray, w: np.ndarray, rotati
         weight *= scale[:, None] * math.pi / rows
     phi = (np.arange(columns)[:, None] + x) * (2 * math.pi / columns) - math.pi + rotation
     across = np.broadcast_to(w * (2 * math.pi / columns), phi.shape)
-    return (np.stack([np.cos(theta), np.sin(theta), weight], -1).reshape(-1, 3),
-            np.stack([np.cos(phi), np.sin(phi), across], -1).reshape(-1, 3))
+    return (
+        np.stack([np.cos(theta), np.sin(theta), weight], -1).reshape(-1, 3),
+        np.stack([np.cos(phi), np.sin(phi), across], -1).reshape(-1, 3),
+    )
 
 
-def cube_tables(size: int, x: np.ndarray, w: np.ndarray,
-                scale: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+def cube_tables(
+    size: int, x: np.ndarray, w: np.ndarray, scale: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the quadrature tables of a cube's face, by refined row and by refined column.
 
     size: texels an edge. x, w: nodes and weights on [0, 1] within a texel.
@@ -362,8 +367,8 @@ def _taps(found: list[dict[int, float]]) -> tuple[np.ndarray, np.ndarray, np.nda
     scale = np.array([sum(taps.values()) for taps in found])
     tap, factor = np.zeros((len(found), TAPS), np.int32), np.zeros((len(found), TAPS), np.float32)
     for k, taps in enumerate(found):
-        tap[k, :len(taps)] = list(taps)
-        factor[k, :len(taps)] = np.array(list(taps.values())) / scale[k]
+        tap[k, : len(taps)] = list(taps)
+        factor[k, : len(taps)] = np.array(list(taps.values())) / scale[k]
     return tap, factor, scale
 
 

@@ -3,6 +3,7 @@
 Coefficients are (9, 3) or (..., 9, 3): L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22 by RGB, of a real orthonormal
 basis in world x, y, z without the Condon-Shortley sign. Irradiance is E/π: a constant environment of 1 gives 1.
 """
+
 from __future__ import annotations
 
 import math
@@ -70,8 +71,20 @@ def polynomial(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
 
 def coefficients_of(c: np.ndarray, b: np.ndarray, q: np.ndarray) -> np.ndarray:
     """Return the coefficients (..., 9) of a polynomial: the inverse of `polynomial`."""
-    k = np.stack([c, b[..., 1], b[..., 2], b[..., 0], 2 * q[..., 0, 1], 2 * q[..., 1, 2], q[..., 2, 2] / 2,
-                  2 * q[..., 0, 2], (q[..., 0, 0] - q[..., 1, 1]) / 2], -1)
+    k = np.stack(
+        [
+            c,
+            b[..., 1],
+            b[..., 2],
+            b[..., 0],
+            2 * q[..., 0, 1],
+            2 * q[..., 1, 2],
+            q[..., 2, 2] / 2,
+            2 * q[..., 0, 2],
+            (q[..., 0, 0] - q[..., 1, 1]) / 2,
+        ],
+        -1,
+    )
     return np.asarray(k / FACTORS)
 
 
@@ -102,7 +115,7 @@ def minimum(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.divide(-half, gap + t[..., None], out=np.zeros_like(half), where=size > 0)
 
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        inside = (step(np.zeros_like(low))**2).sum(-1) <= 1
+        inside = (step(np.zeros_like(low)) ** 2).sum(-1) <= 1
         # Newton's method on 1/|n(t)| = 1, concave and almost straight, within a shrinking bracket.
         t = np.where(inside, 0.0, low)
         for _ in range(100):
@@ -120,7 +133,7 @@ def minimum(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         energy = np.divide(half**2, gap + t[..., None], out=np.zeros_like(half), where=size > 0).sum(-1)
         n = step(t)
     least = c + eigenvalues[..., 0] - t - energy
-    rest = np.sqrt(np.maximum(1 - (n[..., 1:]**2).sum(-1), 0))
+    rest = np.sqrt(np.maximum(1 - (n[..., 1:] ** 2).sum(-1), 0))
     n[..., 0] = np.where(inside, rest, n[..., 0])
     where = np.einsum("...ij,...j->...i", axes, n)
     return least, where / np.sqrt((where**2).sum(-1, keepdims=True))
@@ -168,7 +181,7 @@ def sinc_window(cutoff: float) -> np.ndarray:
     It is the window of Filament's `cmgen --sh-window=X`. [Sloan2017]
     """
     degree = np.arange(3)
-    return np.asarray(np.where(degree < cutoff, np.sinc(degree / cutoff)**4, 0.0))
+    return np.asarray(np.where(degree < cutoff, np.sinc(degree / cutoff) ** 4, 0.0))
 
 
 def windowed(sh: np.ndarray, mode: str | float = "auto") -> Windowed:
@@ -219,7 +232,7 @@ def _nearest(irradiance: np.ndarray, least: np.ndarray) -> np.ndarray:
     if (mean < 0).any():
         raise InputError("the mean of an SH channel is negative, so no window makes its irradiance non-negative")
     enough = (least >= -scale).all(-1)
-    power = np.stack([(channels[..., BANDS == band]**2).sum((-1, -2)) for band in (1, 2)], -1)  # (..., 2)
+    power = np.stack([(channels[..., BANDS == band] ** 2).sum((-1, -2)) for band in (1, 2)], -1)  # (..., 2)
     low, high = np.zeros(enough.shape), np.full(enough.shape, math.pi / 2)
     best, cost = np.zeros((*enough.shape, 2)), np.full(enough.shape, np.inf)
     todo = not enough.all()
@@ -229,7 +242,7 @@ def _nearest(irradiance: np.ndarray, least: np.ndarray) -> np.ndarray:
         ray = np.stack([np.cos(phi), np.sin(phi)], -1)
         ray[..., 0] = np.where(phi == math.pi / 2, 0.0, ray[..., 0])
         point, normal = _edge(channels, mean, ray)
-        value = (power * (1 - point)**2).sum(-1)
+        value = (power * (1 - point) ** 2).sum(-1)
         better = value < cost
         best, cost = np.where(better[..., None], point, best), np.where(better, value, cost)
         # The edge's direction with φ growing: at right angles to its normal, to the left of the ray.
@@ -264,8 +277,9 @@ def _edge(channels: np.ndarray, mean: np.ndarray, ray: np.ndarray) -> tuple[np.n
 
 
 # --------------------------------------------------------------------------------------------------- error
-def rmse_against(sh: np.ndarray, irradiance: np.ndarray, directions: np.ndarray,
-                 solid_angles: np.ndarray) -> tuple[float, float]:
+def rmse_against(
+    sh: np.ndarray, irradiance: np.ndarray, directions: np.ndarray, solid_angles: np.ndarray
+) -> tuple[float, float]:
     """Return the relative RMSE of E/π by radiance coefficients, and its largest |error| over the mean.
 
     sh: (9, 3). irradiance: the true cube, (6, s, s, 3). directions, solid_angles: of its texel centres, (3, 6s²) and
@@ -326,8 +340,17 @@ def _from_polynomial() -> np.ndarray:
     harmonicsFunctions). Its own files agree, as FromHarmonics puts the kernel onto E/π a second time.
     """
     x, y, z, xx, yy, zz, yz, zx, xy = np.eye(9)
-    rows = [0.376127 * xx + 0.376127 * yy + 0.376126 * zz, -0.977204 * y, 0.977204 * z, -0.977204 * x, 1.16538 * xy,
-            -1.16538 * yz, 1.34567 * zz - 0.672834 * xx - 0.672834 * yy, -1.16538 * zx, 1.16538 * xx - 1.16538 * yy]
+    rows = [
+        0.376127 * xx + 0.376127 * yy + 0.376126 * zz,
+        -0.977204 * y,
+        0.977204 * z,
+        -0.977204 * x,
+        1.16538 * xy,
+        -1.16538 * yz,
+        1.34567 * zz - 0.672834 * xx - 0.672834 * yy,
+        -1.16538 * zx,
+        1.16538 * xx - 1.16538 * yy,
+    ]
     return math.pi * np.stack(rows) * CONDON_SHORTLEY[:, None]
 
 
@@ -340,7 +363,11 @@ def babylon(sh: np.ndarray) -> np.ndarray:
 
 
 SCALINGS: dict[str, Callable[[Any], np.ndarray]] = {
-    "radiance": radiance, "irradiance": irradiance, "filament": filament, "babylon": babylon}
+    "radiance": radiance,
+    "irradiance": irradiance,
+    "filament": filament,
+    "babylon": babylon,
+}
 """By the name a preset gives; each takes radiance coefficients (..., 9, 3), in the engine's own axes."""
 
 

@@ -1,4 +1,5 @@
 """Finds the texels of a level nearest to given directions, which a certificate checks beside its uniform draw."""
+
 from __future__ import annotations
 
 from functools import lru_cache
@@ -43,6 +44,10 @@ def _tiles(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     small = not any(n % 8 for n in shape.dims[-2:]) and (not shape.latlong or shape.size >= 32)
     seen = order[:, CORNERS] if small else order
     part = PART // TEXELS
-    found = np.concatenate([bounds(shape.directions(seen[first:first + part].ravel()), seen.shape[1])
-                            for first in range(0, len(seen), part)])
+    found = np.concatenate(
+        [
+            bounds(shape.directions(seen[first : first + part].ravel()), seen.shape[1])
+            for first in range(0, len(seen), part)
+        ]
+    )
     return order, found[:, :3], found[:, 3]

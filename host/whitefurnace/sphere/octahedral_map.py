@@ -84,8 +84,10 @@ def to_atlas(levels: Sequence[np.ndarray], b: int) -> tuple[np.ndarray, tuple[Pl
     What belongs to no map is 0.
     """
     places = atlas_places(levels[0].shape[0], len(levels), b)
-    height, width = (max(side + b for side in sides) for sides in
-                     zip(*((p.row + p.side, p.column + p.side) for p in places), strict=True))
+    height, width = (
+        max(side + b for side in sides)
+        for sides in zip(*((p.row + p.side, p.column + p.side) for p in places), strict=True)
+    )
     image = np.zeros((height, width, levels[0].shape[2]), levels[0].dtype)
     for level, p in zip(levels, places, strict=True):
         if level.shape[0] != p.side:
@@ -106,5 +108,6 @@ def _bilinear(images: np.ndarray, k: np.ndarray, x: np.ndarray, y: np.ndarray) -
     i = np.clip(np.floor(y).astype(int), 0, height - 1)
     right, below = np.minimum(j + 1, width - 1), np.minimum(i + 1, height - 1)
     a, e = (x - j)[:, None], (y - i)[:, None]
-    return ((images[k, i, j] * (1 - a) + images[k, i, right] * a) * (1 - e)
-            + (images[k, below, j] * (1 - a) + images[k, below, right] * a) * e)
+    return (images[k, i, j] * (1 - a) + images[k, i, right] * a) * (1 - e) + (
+        images[k, below, j] * (1 - a) + images[k, below, right] * a
+    ) * e

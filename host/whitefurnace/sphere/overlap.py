@@ -6,6 +6,7 @@ exactly; a cube source over a face coordinate s by Gauss nodes and along t exact
 columns, corners, places where a side of the texel crosses a row) the integrand is analytic and the rows that a side
 lies in are fixed, so a texel is left with rounding only.
 """
+
 from __future__ import annotations
 
 import itertools
@@ -33,8 +34,9 @@ ALIGNED = 256
 piece."""
 
 
-def mean_over_texels(texels: npt.NDArray[np.float32], rotation: float, latlong_output: bool, size: int,
-                     indices: npt.NDArray[np.integer]) -> Floats:
+def mean_over_texels(
+    texels: npt.NDArray[np.float32], rotation: float, latlong_output: bool, size: int, indices: npt.NDArray[np.integer]
+) -> Floats:
     """Return the mean radiance of a source over each output texel, by exact solid angles: (m, 3) float64.
 
     texels: radiance, (h, w, 3) of a lat-long or (6, n, n, 3) of a cube in the GL-direct layout, constant over each
@@ -52,14 +54,14 @@ def mean_over_texels(texels: npt.NDArray[np.float32], rotation: float, latlong_o
     if texels.ndim == 4 and not latlong_output and rotation == 0 and texels.shape[1] <= ALIGNED * size:
         return _cube_on_cube(texels, size, flat)
     for first in range(0, len(flat), BATCH):
-        part = flat[first:first + BATCH]
+        part = flat[first : first + BATCH]
         if texels.ndim == 3:
             sums, area = _cube_from_latlong(texels, rotation, size, part)
         elif latlong_output:
             sums, area = _latlong_from_cube(texels, rotation, size, part)
         else:
             sums, area = _cube_from_cube(texels, rotation, size, part)
-        out[first:first + BATCH] = sums / area[:, None]
+        out[first : first + BATCH] = sums / area[:, None]
     return out
 
 
@@ -108,7 +110,7 @@ def _latlong_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size
         x0, x1 = j * ratio - shift, (j + 1) * ratio - shift
         c = np.arange(math.floor(x0), math.ceil(x1))
         across = np.maximum(np.minimum(c + 1, x1) - np.maximum(c, x0), 0)
-        block = texels[r[0]:r[-1] + 1].take(c % columns, axis=1).astype(np.float64)
+        block = texels[r[0] : r[-1] + 1].take(c % columns, axis=1).astype(np.float64)
         by_column = (down @ block.reshape(len(r), -1)).reshape(-1, 3)
         out[k] = across @ by_column / (down.sum() * across.sum())
     return out
@@ -122,8 +124,9 @@ def _versine(tau: Floats) -> Floats:
     return np.where(tau < np.inf, value, 0.0)
 
 
-def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: int,
-                       flat: Ints) -> tuple[Floats, Floats]:
+def _cube_from_latlong(
+    texels: npt.NDArray[np.float32], rotation: float, size: int, flat: Ints
+) -> tuple[Floats, Floats]:
     """∫dφ ∫dy L over each texel (m, 3), and its solid angle (m,).
 
     At azimuth φ the texel is an interval of τ = cot θ. On a side face, ψ = φ - φ_axis: a side t = const is
@@ -214,8 +217,9 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
         n = np.arange(len(own))
         # Along an axis the ray never meets the sides parallel to it.
         enter = np.where((sine == 0) | (hits[enter_x, n] > hits[enter_z, n]) & (cosine != 0), enter_x, enter_z)
-        leave = np.where((sine == 0) | (hits[1 - enter_x, n] < hits[5 - enter_z, n]) & (cosine != 0), 1 - enter_x,
-                         5 - enter_z)
+        leave = np.where(
+            (sine == 0) | (hits[1 - enter_x, n] < hits[5 - enter_z, n]) & (cosine != 0), 1 - enter_x, 5 - enter_z
+        )
         pole = on & ~(hits[enter, n] > 0)
         inverse_in, inverse_out = 1 / lines[enter, n], 1 / lines[leave, n]
     # A breakpoint rounded past an axis leaves a piece of 1e-16 rad where no side is left: no weight.
@@ -254,8 +258,11 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
     def radiance(r: Ints, c: Ints, flipped: npt.NDArray[np.bool_]) -> Floats:
         return texels[np.where(flipped, rows - 1 - r, r), c].astype(np.float64)
 
-    sums = _sum_by(own, first_weight[:, None] * radiance(r_up, column, flip)
-                   + last_weight[:, None] * radiance(r_down, column, flip), m)
+    sums = _sum_by(
+        own,
+        first_weight[:, None] * radiance(r_up, column, flip) + last_weight[:, None] * radiance(r_down, column, flip),
+        m,
+    )
     area = np.bincount(own, width * (v_down - v_up), m).astype(np.float64)
 
     # Rows wholly between the two sides.
@@ -267,20 +274,36 @@ def _cube_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: i
     for number in np.flatnonzero(r_last - r_first > TALL):
         here = np.flatnonzero(own == number)
         top, bottom = int(r_up[here].min()), int(r_down[here].max()) + 1
-        sums[number] += _between(texels[::-1] if south[number] else texels, top, bottom, step, column[here],
-                                 width[here], r_up[here] + 1 - top, r_down[here] - top)
+        sums[number] += _between(
+            texels[::-1] if south[number] else texels,
+            top,
+            bottom,
+            step,
+            column[here],
+            width[here],
+            r_up[here] + 1 - top,
+            r_down[here] - top,
+        )
     return sums, area
 
 
-def _between(texels: npt.NDArray[np.float32], top: int, bottom: int, step: Floats, column: Ints, width: Floats,
-             first: Ints, last: Ints) -> Floats:
+def _between(
+    texels: npt.NDArray[np.float32],
+    top: int,
+    bottom: int,
+    step: Floats,
+    column: Ints,
+    width: Floats,
+    first: Ints,
+    last: Ints,
+) -> Floats:
     """(3,): ∑ width · ∑ over rows top + first … top + last - 1 of step · L, by prefix sums of the columns used."""
     total = np.zeros(3)
     used, which = np.unique(column, return_inverse=True)
     last = np.maximum(first, last)
     per = max(BLOCK // (bottom - top), 1)
     for begin in range(0, len(used), per):
-        block = texels[top:bottom].take(used[begin:begin + per], axis=1)
+        block = texels[top:bottom].take(used[begin : begin + per], axis=1)
         prefix = np.zeros((bottom - top + 1, *block.shape[1:]))
         np.cumsum(block * step[top:bottom, None, None], axis=0, out=prefix[1:])
         here = (which >= begin) & (which < begin + per)
@@ -297,8 +320,9 @@ _NONE_BELOW = np.array([-1.0, 0.0, 0.0, 1.0, 0.0])
 _NONE_ABOVE = np.array([1.0, 0.0, 0.0, 1.0, 0.0])
 
 
-def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Floats, below: Floats, above: Floats,
-             extra: Floats) -> tuple[Floats, Floats]:
+def _regions(
+    texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Floats, below: Floats, above: Floats, extra: Floats
+) -> tuple[Floats, Floats]:
     """∫∫ L (1 + s² + t²)^{-3/2} dt ds over regions of face planes: (R, 3), and with L = 1: (R,).
 
     texels: (6 n², 3). place: (R, 3), the flat index of texel (s, t) = (0, 0) of a region's face and the steps to
@@ -310,8 +334,9 @@ def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Fl
     keep = np.flatnonzero(high > low)
     owners: list[Ints] = []
     points: list[Floats] = []
-    k, c = _ranges(np.ceil((low[keep] + 1) / 2 * n).astype(np.int64),
-                   np.floor((high[keep] + 1) / 2 * n).astype(np.int64) + 1)
+    k, c = _ranges(
+        np.ceil((low[keep] + 1) / 2 * n).astype(np.int64), np.floor((high[keep] + 1) / 2 * n).astype(np.int64) + 1
+    )
     owners.append(keep[k])
     points.append((2 * c - n) / n)
     owners.append(np.repeat(keep, extra.shape[1]))
@@ -376,8 +401,7 @@ def _regions(texels: npt.NDArray[np.float32], place: Ints, low: Floats, high: Fl
     last *= width
     origin = place[own, 0] + column * place[own, 1]
     step = place[own, 2]
-    sums = _sum_by(own, first[:, None] * texels[origin + r0 * step] + last[:, None] * texels[origin + r1 * step],
-                   count)
+    sums = _sum_by(own, first[:, None] * texels[origin + r0 * step] + last[:, None] * texels[origin + r1 * step], count)
     area = np.bincount(own, first + last, count).astype(np.float64)
 
     # Texels wholly between the two sides, by Gauss nodes too, in pieces of bounded memory.
@@ -405,7 +429,7 @@ def _cube_on_cube(texels: npt.NDArray[np.float32], size: int, flat: Ints) -> Flo
     out = np.empty((len(flat), 3))
     step = max(BLOCK // (n // size + 2) ** 2, 1)
     for begin in range(0, len(flat), step):
-        face, rest = np.divmod(flat[begin:begin + step], size * size)
+        face, rest = np.divmod(flat[begin : begin + step], size * size)
         i, j = np.divmod(rest, size)
         strip, c = _ranges(j * n // size, -(-(j + 1) * n // size))
         piece, r = _ranges((i * n // size)[strip], -(-(i + 1)[strip] * n // size))
@@ -423,7 +447,7 @@ def _cube_on_cube(texels: npt.NDArray[np.float32], size: int, flat: Ints) -> Flo
         weight *= s1 - s0
         values = texels[face[own], r, c].astype(np.float64)
         area = np.bincount(own, weight, len(face))
-        out[begin:begin + step] = _sum_by(own, weight[:, None] * values, len(face)) / area[:, None]
+        out[begin : begin + step] = _sum_by(own, weight[:, None] * values, len(face)) / area[:, None]
     return out
 
 
@@ -437,8 +461,7 @@ def _places(n: int, face: Ints) -> Ints:
     return np.stack([face * n * n, np.full_like(face, 1), np.full_like(face, n)], 1)
 
 
-def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
-                    flat: Ints) -> tuple[Floats, Floats]:
+def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int, flat: Ints) -> tuple[Floats, Floats]:
     """Texel and solid angle of each, from the six source faces: in their planes a texel is the polygon that its
     four side planes n·d ≥ 0 cut out."""
     n, m = texels.shape[1], len(flat)
@@ -455,8 +478,9 @@ def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
             for c in range(3):
                 planes[k, c, here] = (world[0][c] * s + world[1][c] * t + world[2][c] * axis)[here]
     cosine, sine = math.cos(rotation), math.sin(rotation)
-    planes = np.stack([cosine * planes[:, 0] + sine * planes[:, 2], planes[:, 1],
-                       cosine * planes[:, 2] - sine * planes[:, 0]], 1)
+    planes = np.stack(
+        [cosine * planes[:, 0] + sine * planes[:, 2], planes[:, 1], cosine * planes[:, 2] - sine * planes[:, 0]], 1
+    )
     low, high = np.full((6, m), -1.0), np.full((6, m), 1.0)
     below, above = np.tile(_NONE_BELOW, (6, m, 4, 1)), np.tile(_NONE_ABOVE, (6, m, 4, 1))
     lines = np.empty((6, 8, 3, m))  # the texel's sides and the face's, (a, b, c) of a s + b t + c >= 0
@@ -490,20 +514,30 @@ def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
     low = np.maximum(low, np.where(np.isnan(extra), 2.0, extra).min(-1))
     high = np.minimum(high, np.where(np.isnan(extra), -2.0, extra).max(-1))
     extra = extra.reshape(6 * m, -1)
-    sums, area = _regions(texels.reshape(-1, 3), _places(n, np.repeat(np.arange(6), m)),
-                          low.ravel(), high.ravel(), below.reshape(6 * m, 4, 5), above.reshape(6 * m, 4, 5), extra)
+    sums, area = _regions(
+        texels.reshape(-1, 3),
+        _places(n, np.repeat(np.arange(6), m)),
+        low.ravel(),
+        high.ravel(),
+        below.reshape(6 * m, 4, 5),
+        above.reshape(6 * m, 4, 5),
+        extra,
+    )
     return sums.reshape(6, m, 3).sum(0), area.reshape(6, m).sum(0)
 
 
 def _frame(face: int) -> tuple[tuple[float, float, float], ...]:
     """World vectors of a face's s, t and axis."""
-    basis = [_to_face(face, (np.float64(x), np.float64(y), np.float64(z)))  # type: ignore[arg-type]
-             for x, y, z in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    basis = [
+        _to_face(face, (np.float64(x), np.float64(y), np.float64(z)))  # type: ignore[arg-type]
+        for x, y, z in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    ]
     return tuple((float(basis[0][k]), float(basis[1][k]), float(basis[2][k])) for k in range(3))
 
 
-def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int,
-                       flat: Ints) -> tuple[Floats, Floats]:
+def _latlong_from_cube(
+    texels: npt.NDArray[np.float32], rotation: float, size: int, flat: Ints
+) -> tuple[Floats, Floats]:
     """Each texel and its solid angle, over the source faces.
 
     On a side face s = -tan ψ, so meridians bound s and a parallel is t = -cot θ √(1 + s²). On ±Y a texel is a
@@ -520,8 +554,14 @@ def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: i
     quarter = math.pi / 4
     place, low, high, below, above, extra = [], [], [], [], [], []
 
-    def add(where: Ints, s0: Floats, s1: Floats, under: list[tuple[Floats, ...]],
-            over: list[tuple[Floats, ...]], meet: list[Floats]) -> None:
+    def add(
+        where: Ints,
+        s0: Floats,
+        s1: Floats,
+        under: list[tuple[Floats, ...]],
+        over: list[tuple[Floats, ...]],
+        meet: list[Floats],
+    ) -> None:
         place.append(np.broadcast_to(where, (m, 3)))
         low.append(s0)
         high.append(s1)
@@ -537,9 +577,14 @@ def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: i
             a = np.clip(phi0 - axis + 2 * math.pi * turn, -quarter, quarter)
             b = np.clip(phi1 - axis + 2 * math.pi * turn, -quarter, quarter)
             top, bottom = np.clip(-cot0, -4, 4), np.clip(-cot1, -4, 4)
-            add(_places(n, np.array([face]))[0], np.where(b == quarter, -1.0, -np.tan(b)),
+            add(
+                _places(n, np.array([face]))[0],
+                np.where(b == quarter, -1.0, -np.tan(b)),
                 np.where(a == -quarter, 1.0, -np.tan(a)),
-                [(zero, zero, top, one, one)], [(zero, zero, bottom, one, one)], [nothing])
+                [(zero, zero, top, one, one)],
+                [(zero, zero, bottom, one, one)],
+                [nothing],
+            )
     for south in (False, True):
         near, far = (-cot1, -cot0) if south else (cot0, cot1)  # |cot θ| grows towards the pole
         with np.errstate(divide="ignore"):
@@ -569,14 +614,28 @@ def _latlong_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: i
                 top_p = np.where(live, np.minimum(outer * np.sin(b), 1.0), -1.0)
                 meet = [rho * np.sin(angle) for rho in (inner, outer) for angle in (a, b)]
                 meet += [np.tan(a), np.tan(b)]
-                add(np.array([origin, step_s, step_t]), np.where(live, inner * np.sin(a), 0.0), top_p,
+                add(
+                    np.array([origin, step_s, step_t]),
+                    np.where(live, inner * np.sin(a), 0.0),
+                    top_p,
                     [(zero, zero, one, inner**2, -one), (zero, ray_b, zero, one, zero)],
-                    [(zero, zero, one, outer**2, -one),
-                     (np.where(a > 0, 0.0, 1e300), np.where(a > 0, ray_a, 0.0), zero, one, zero)], meet)
+                    [
+                        (zero, zero, one, outer**2, -one),
+                        (np.where(a > 0, 0.0, 1e300), np.where(a > 0, ray_a, 0.0), zero, one, zero),
+                    ],
+                    meet,
+                )
     # Side faces have one side each way: padded with a copy to two, as on ±Y.
     both = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in below]
     over = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in above]
     meets = [np.pad(x, ((0, 0), (0, 6 - x.shape[1])), constant_values=np.nan) for x in extra]
-    sums, area = _regions(texels.reshape(-1, 3), np.concatenate(place), np.concatenate(low),
-                          np.concatenate(high), np.concatenate(both), np.concatenate(over), np.concatenate(meets))
+    sums, area = _regions(
+        texels.reshape(-1, 3),
+        np.concatenate(place),
+        np.concatenate(low),
+        np.concatenate(high),
+        np.concatenate(both),
+        np.concatenate(over),
+        np.concatenate(meets),
+    )
     return sums.reshape(-1, m, 3).sum(0), area.reshape(-1, m).sum(0)

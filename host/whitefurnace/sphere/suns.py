@@ -3,6 +3,7 @@
 A sun holds most of the light in a few texels. Engines cast its shadows from a light of its own, and a prefiltered copy
 of it would light everything twice.
 """
+
 from __future__ import annotations
 
 import math
@@ -57,9 +58,15 @@ class Sun:
 
     def data(self) -> dict[str, Any]:
         """Return the sun as plain data, for manifests."""
-        return {"direction": list(self.direction), "angular_radius": self.angular_radius,
-                "radiance": list(self.radiance), "irradiance": list(self.irradiance), "c": list(self.c),
-                "share": self.share, "texels": self.texels}
+        return {
+            "direction": list(self.direction),
+            "angular_radius": self.angular_radius,
+            "radiance": list(self.radiance),
+            "irradiance": list(self.irradiance),
+            "c": list(self.c),
+            "share": self.share,
+            "texels": self.texels,
+        }
 
 
 def sun_mode(mode: str) -> tuple[str, float]:
@@ -101,8 +108,9 @@ def without_sun(env: Environment, mode: str) -> tuple[Environment, Sun | None]:
     return _extracted(env, flat, level, weights, energy)
 
 
-def _clamped(env: Environment, flat: np.ndarray, level: np.ndarray, weights: np.ndarray, energy: float,
-             bound: float) -> Environment:
+def _clamped(
+    env: Environment, flat: np.ndarray, level: np.ndarray, weights: np.ndarray, energy: float, bound: float
+) -> Environment:
     most = bound * energy / (4 * math.pi)
     over = level > most
     if not over.any():
@@ -110,13 +118,17 @@ def _clamped(env: Environment, flat: np.ndarray, level: np.ndarray, weights: np.
     texels = flat.copy()
     texels[over] *= (most / level[over])[:, None].astype(np.float32)
     taken = float(((level - most) * weights)[over].sum()) / energy
-    return _with(env, texels.reshape(env.texels.shape),
-                 f"{int(over.sum())} texels over {bound:g} times the mean were clamped, which took {100 * taken:.3g} % "
-                 "of the energy")
+    return _with(
+        env,
+        texels.reshape(env.texels.shape),
+        f"{int(over.sum())} texels over {bound:g} times the mean were clamped, which took {100 * taken:.3g} % "
+        "of the energy",
+    )
 
 
-def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: np.ndarray,
-               energy: float) -> tuple[Environment, Sun | None]:
+def _extracted(
+    env: Environment, flat: np.ndarray, level: np.ndarray, weights: np.ndarray, energy: float
+) -> tuple[Environment, Sun | None]:
     index = np.arange(level.size)
     top = int(level.argmax())
     cosine = source_directions(env, np.array([top]))[:, 0] @ source_directions(env, index)
@@ -124,15 +136,23 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
     around = index[cosine >= math.cos(CAP)]
     sky = float(np.median(level[ring])) if ring.size else 0.0
     if ring.size == 0 or level[top] <= STANDS_OUT * sky:
-        return _with(env, env.texels, f"no sun was found: the brightest texel is {level[top] / max(sky, 1e-30):.3g} "
-                                      f"times the sky around it, and {STANDS_OUT:g} times is what is looked for"), None
+        return _with(
+            env,
+            env.texels,
+            f"no sun was found: the brightest texel is {level[top] / max(sky, 1e-30):.3g} "
+            f"times the sky around it, and {STANDS_OUT:g} times is what is looked for",
+        ), None
     # The geometric mean of peak and sky parts a disc from its glare; a black sky leaves a thousandth of the peak.
     bound = max(math.sqrt(level[top] * max(sky, 1e-6 * level[top])), STANDS_OUT * sky)
     held = around[level[around] > bound]
     beyond = ring[level[ring] > bound]
     if float(level[beyond] @ weights[beyond]) > WIDER * float(level[held] @ weights[held]):
-        return _with(env, env.texels, "no sun was found: what stands out about the brightest texel reaches further "
-                                      f"than {math.degrees(CAP):g}°, a panel rather than a sun"), None
+        return _with(
+            env,
+            env.texels,
+            "no sun was found: what stands out about the brightest texel reaches further "
+            f"than {math.degrees(CAP):g}°, a panel rather than a sun",
+        ), None
     towards = source_directions(env, held)
     centre = towards @ (level[held] * weights[held])
     centre /= np.linalg.norm(centre)
@@ -151,13 +171,26 @@ def _extracted(env: Environment, flat: np.ndarray, level: np.ndarray, weights: n
     irradiance = (weights[held] * (centre @ towards)) @ excess
     share = float(power.mean()) / energy
     if share < LEAST:
-        return _with(env, env.texels, f"no sun was found: what stands out most holds {100 * share:.2g} % of the energy "
-                                      f"and {100 * LEAST:g} % is what is looked for"), None
-    sun = Sun(tuple(centre.tolist()), math.acos(max(-1.0, 1 - solid / (2 * math.pi))), tuple((power / solid).tolist()),
-              tuple(irradiance.tolist()), tuple((irradiance / math.pi).tolist()), share, int(held.size))
-    text = (f"the sun was taken out of {held.size} texel{'s' if held.size > 1 else ''}, {100 * share:.3g} % of the "
-            "energy: light it as a directional light of irradiance "
-            f"({', '.join(f'{x:.4g}' for x in sun.irradiance)}) from ({', '.join(f'{x:.4f}' for x in sun.direction)})")
+        return _with(
+            env,
+            env.texels,
+            f"no sun was found: what stands out most holds {100 * share:.2g} % of the energy "
+            f"and {100 * LEAST:g} % is what is looked for",
+        ), None
+    sun = Sun(
+        tuple(centre.tolist()),
+        math.acos(max(-1.0, 1 - solid / (2 * math.pi))),
+        tuple((power / solid).tolist()),
+        tuple(irradiance.tolist()),
+        tuple((irradiance / math.pi).tolist()),
+        share,
+        int(held.size),
+    )
+    text = (
+        f"the sun was taken out of {held.size} texel{'s' if held.size > 1 else ''}, {100 * share:.3g} % of the "
+        "energy: light it as a directional light of irradiance "
+        f"({', '.join(f'{x:.4g}' for x in sun.irradiance)}) from ({', '.join(f'{x:.4f}' for x in sun.direction)})"
+    )
     return _with(env, texels.reshape(env.texels.shape), text), sun
 
 

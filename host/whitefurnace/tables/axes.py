@@ -1,4 +1,5 @@
 """Axes of a table: their values, how they are given, which a table has by itself, and the columns that follow."""
+
 from __future__ import annotations
 
 import math
@@ -157,8 +158,13 @@ class Size:
 
 def size_of(given: int | str | Sequence[int]) -> Size:
     """The size from `N`, "NxM" or a pair. Raises UsageError."""
-    items: list[Any] = given.lower().replace("×", "x").split("x") if isinstance(given, str) else \
-        list(given) if isinstance(given, Sequence) else [given]
+    items: list[Any] = (
+        given.lower().replace("×", "x").split("x")
+        if isinstance(given, str)
+        else list(given)
+        if isinstance(given, Sequence)
+        else [given]
+    )
     try:
         counts = [_count(int(item)) for item in items]
     except (TypeError, ValueError):
@@ -190,8 +196,13 @@ def number(name: str, value: Any) -> float:
     try:
         found = float(value)
     except (TypeError, ValueError):
-        hint = f"; give a range as an axis, {name}={value}" if isinstance(value, str) and ":" in value else \
-            "; RGB goes with its model, as schlick:f0=1/.71/.29" if isinstance(value, str) and "/" in value else ""
+        hint = (
+            f"; give a range as an axis, {name}={value}"
+            if isinstance(value, str) and ":" in value
+            else "; RGB goes with its model, as schlick:f0=1/.71/.29"
+            if isinstance(value, str) and "/" in value
+            else ""
+        )
         raise UsageError(f"{name}={value!r} is not a number{hint}") from None
     if not math.isfinite(found):
         raise UsageError(f"{name}={value!r} is not finite")
@@ -203,14 +214,16 @@ def number(name: str, value: Any) -> float:
 
 def centred(size: Size) -> dict[str, Axis]:
     """The default axes of most tables: x is NoV and y roughness, both at the centres of texels."""
-    return {"NoV": Axis("NoV", 0.0, 1.0, size.across, "centres"),
-            "roughness": Axis("roughness", 0.0, 1.0, size.down, "centres")}
+    return {
+        "NoV": Axis("NoV", 0.0, 1.0, size.across, "centres"),
+        "roughness": Axis("roughness", 0.0, 1.0, size.down, "centres"),
+    }
 
 
-def usual_beside(usual: Mapping[str, Ends], given: Mapping[str, Any], fixed: Mapping[str, float],
-                 slot: str = "fresnel") -> dict[str, Any]:
-    """The axes of `usual` that are neither given nor fixed, by their name or as SLOT_NAME, before those that are given.
-    """
+def usual_beside(
+    usual: Mapping[str, Ends], given: Mapping[str, Any], fixed: Mapping[str, float], slot: str = "fresnel"
+) -> dict[str, Any]:
+    """The axes of `usual` that are neither given nor fixed, by their name or as SLOT_NAME, before those that are given."""
     taken = {*given, *fixed}
     return {**{name: ends for name, ends in usual.items() if not {name, f"{slot}_{name}"} & taken}, **given}
 
@@ -218,8 +231,13 @@ def usual_beside(usual: Mapping[str, Ends], given: Mapping[str, Any], fixed: Map
 def over_first_parameter(choice: Chosen, fixed: Collection[str], count: int) -> dict[str, Axis]:
     """An axis over the first parameter of a model that has no value: over its domain where that ends at 1, otherwise
     from the least to the largest of its typical values."""
-    free = [p for p in choice.model.parameters if p.default is None and p.name not in choice.given
-            and not {p.name, f"{choice.model.slot}_{p.name}"} & set(fixed)]
+    free = [
+        p
+        for p in choice.model.parameters
+        if p.default is None
+        and p.name not in choice.given
+        and not {p.name, f"{choice.model.slot}_{p.name}"} & set(fixed)
+    ]
     ends = {p.name: (p.low, p.high) if p.high <= 1 else (min(p.typical), max(p.typical)) for p in free[:1]}
     return {name: Axis(name, *both, count) for name, both in ends.items()}
 
@@ -228,12 +246,23 @@ def following(choice: Chosen, taken: Collection[str]) -> list[str]:
     """The parameters of a model that follow roughness and are not given otherwise; `taken` are the names given."""
     entry = choice.model
     follow = entry.from_roughness(0.5) if entry.from_roughness else {}
-    return [name for name in follow if name not in choice.given and f"{entry.slot}_{name}" not in taken and
-            (name not in taken or name == "roughness")]
+    return [
+        name
+        for name in follow
+        if name not in choice.given
+        and f"{entry.slot}_{name}" not in taken
+        and (name not in taken or name == "roughness")
+    ]
 
 
-def placed(default: Mapping[str, Axis], size: Size, view: bool, models: Mapping[str, Chosen],
-           axes: Mapping[str, AxisSpec], fixed: Mapping[str, float]) -> tuple[Axis, ...]:
+def placed(
+    default: Mapping[str, Axis],
+    size: Size,
+    view: bool,
+    models: Mapping[str, Chosen],
+    axes: Mapping[str, AxisSpec],
+    fixed: Mapping[str, float],
+) -> tuple[Axis, ...]:
     """The axes of a table in their order, x first.
 
     default: the table's own axes in their order. One that is fixed is dropped, and so are NoV where there is no view
@@ -249,8 +278,10 @@ def placed(default: Mapping[str, Axis], size: Size, view: bool, models: Mapping[
         if name in fixed:
             raise UsageError(f"{name} is given both as a number and as an axis")
     taken = {*explicit, *fixed}
-    wanted = {"NoV": view and "NoV" not in fixed,
-              "roughness": "roughness" not in fixed and any(following(choice, taken) for choice in models.values())}
+    wanted = {
+        "NoV": view and "NoV" not in fixed,
+        "roughness": "roughness" not in fixed and any(following(choice, taken) for choice in models.values()),
+    }
     found = {name: one for name, one in default.items() if wanted.get(name, name not in fixed)}
     for name, scale in scaled.items():
         if name not in found:
@@ -260,14 +291,18 @@ def placed(default: Mapping[str, Axis], size: Size, view: bool, models: Mapping[
         found[name] = replace(found[name], scale=scale)
     for name, one in sorted(default.items()) if size.both else ():
         if name not in found or name in explicit:
-            raise UsageError(f"size {size.across}x{size.down}: there is no default axis {name} for the {one.count}; "
-                             "give one number")
-    return (*(explicit.get(name, one) for name, one in found.items()),
-            *(one for name, one in explicit.items() if name not in found))
+            raise UsageError(
+                f"size {size.across}x{size.down}: there is no default axis {name} for the {one.count}; give one number"
+            )
+    return (
+        *(explicit.get(name, one) for name, one in found.items()),
+        *(one for name, one in explicit.items() if name not in found),
+    )
 
 
-def columns_of(axes: Sequence[Axis | Points], models: Mapping[str, Chosen],
-               fixed: Mapping[str, float]) -> dict[str, np.ndarray]:
+def columns_of(
+    axes: Sequence[Axis | Points], models: Mapping[str, Chosen], fixed: Mapping[str, float]
+) -> dict[str, np.ndarray]:
     """The parameters that `integrate` takes: numbers, and arrays that broadcast to […, y, x]. Raises UsageError."""
     dimensions = max(len(axes), 2)  # [y, x] at least
     columns = {name: np.array(value) for name, value in fixed.items()}
@@ -280,8 +315,11 @@ def columns_of(axes: Sequence[Axis | Points], models: Mapping[str, Chosen],
         for choice in models.values():
             follow = following(choice, taken)
             if follow:
-                rows |= {name: row for name, row in rows_of_roughness(choice, values).items()
-                         if name.removeprefix(f"{choice.model.slot}_") in follow}
+                rows |= {
+                    name: row
+                    for name, row in rows_of_roughness(choice, values).items()
+                    if name.removeprefix(f"{choice.model.slot}_") in follow
+                }
             elif any(p.name == "roughness" for p in choice.model.parameters) and "roughness" not in choice.given:
                 rows[f"{choice.model.slot}_roughness"] = values
         if not rows:

@@ -1,4 +1,5 @@
 """Bilinear reads of tables as a GPU does them, clamped at the edges: texels fitted for such reads, and their errors."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping

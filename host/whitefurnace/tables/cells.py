@@ -1,4 +1,5 @@
 """The cells of a table (models, parameters, light) and how they are to be computed: what a kind of table works on."""
+
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,8 +46,9 @@ class Cells:
         """The parameters as `integrate` takes them: numbers, and arrays that broadcast to […, y, x]."""
         return self.columns_at(self.axes if self.points is None else self.points)
 
-    def columns_at(self, points: Sequence[Axis | Points],
-                   models: Mapping[str, Chosen] | None = None) -> dict[str, np.ndarray]:
+    def columns_at(
+        self, points: Sequence[Axis | Points], models: Mapping[str, Chosen] | None = None
+    ) -> dict[str, np.ndarray]:
         """The parameters at other values of the axes, or for other models."""
         return columns_of(points, self.models if models is None else models, self.fixed)
 
@@ -71,8 +73,11 @@ class Cells:
         points = []
         for one in self.axes:
             k = np.arange(one.count - 1)
-            points.append(Points(one.name, one.at((k + 1) / one.count if one.scale == "centres" else
-                                                  (k + 0.5) / (one.count - 1))[0]))
+            points.append(
+                Points(
+                    one.name, one.at((k + 1) / one.count if one.scale == "centres" else (k + 0.5) / (one.count - 1))[0]
+                )
+            )
         return self.columns_at(points)
 
 

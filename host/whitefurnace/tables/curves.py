@@ -1,5 +1,6 @@
 """Simple curves that replace costly functions in shaders: a rational function for Smith's term of any NDF, and a
 polynomial for the norm of an NDF. Both are fitted for the smallest maximum error and written as C and GLSL."""
+
 from __future__ import annotations
 
 import math
@@ -82,8 +83,9 @@ def least_largest(residuals: Callable[[np.ndarray], np.ndarray], start: np.ndarr
             system = slope * weight[:, None]
             square, pull = system.T @ system, system.T @ (now * weight)
             # The p-th power's Hessian is p - 1 times that of its weighted squares.
-            step = np.linalg.solve(square + damping * np.diag(np.diag(square) + 1e-14 * np.trace(square)),
-                                   -pull / (power - 1))
+            step = np.linalg.solve(
+                square + damping * np.diag(np.diag(square) + 1e-14 * np.trace(square)), -pull / (power - 1)
+            )
             tried = residuals(at + step)
             before, after = (float(((np.abs(r) / top) ** power).sum()) for r in (now, tried))
             if np.isfinite(after) and after < before:
@@ -118,8 +120,10 @@ def shape_of_smith(scheme: str | None, axes: Sequence[Axis]) -> tuple[int, ...]:
     """
     others = [axis.name for axis in axes if axis.name != "NoV"]
     if len(others) > 1 or len(others) == len(axes):
-        raise UnsupportedError("smith is fitted over NoV and one parameter more, not "
-                               f"{', '.join(axis.name for axis in axes)}: fix the others with --set")
+        raise UnsupportedError(
+            "smith is fitted over NoV and one parameter more, not "
+            f"{', '.join(axis.name for axis in axes)}: fix the others with --set"
+        )
     return (2 if scheme == "rational" else 1, TERMS if others else 1)
 
 
@@ -144,8 +148,9 @@ def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, A
         """c, x and A at shares of the axes, flat, and evaluations."""
         values = {axis.name: axis.at(share(axis))[0] for axis in axes}
         columns: dict[str, Any] = cells.columns_at([Points(*one) for one in values.items()])
-        made = integrate("projected_area", ndf=ndf, precision=finest(run.device), tolerance=1e-8, device=run.device,
-                         **columns)
+        made = integrate(
+            "projected_area", ndf=ndf, precision=finest(run.device), tolerance=1e-8, device=run.device, **columns
+        )
         x = values[along.name] if along else np.zeros(1)
         c, x = (a.ravel() for a in np.broadcast_arrays(values["NoV"][None, :], x[:, None]))
         return c, x, np.asarray(made.values, np.float64).ravel(), made.evaluations
@@ -180,30 +185,44 @@ def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, A
     c2, x2, A2, more = exact(lambda axis: (np.arange(2 * axis.count) + 0.37) / (2 * axis.count))
     powers2 = x2[:, None] ** np.arange(shape[1])
     error = max(float(np.abs(off(held, c, powers, A)).max()), float(np.abs(off(held, c2, powers2, A2)).max()))
-    made = Integrated(values, error, used + more, time.perf_counter() - start, f"least-largest-{scheme}",
-                      ())
+    made = Integrated(values, error, used + more, time.perf_counter() - start, f"least-largest-{scheme}", ())
     if not report:
         return made, {}
     pair = _pairs(scheme, *curves(held, powers2), c2, A2, x2)
     name = along.name if along else "x"
-    formula = "G1 = c/A, A = c + k (1 - c)" + (" q/(q + c)" if scheme == "rational" else "") + \
-        ", c = n·v; V = 1/((n·l) A(n·v) + (n·v) (A(n·l) - n·l)), to be divided by 4"
+    formula = (
+        "G1 = c/A, A = c + k (1 - c)"
+        + (" q/(q + c)" if scheme == "rational" else "")
+        + ", c = n·v; V = 1/((n·l) A(n·v) + (n·v) (A(n·l) - n·l)), to be divided by 4"
+    )
     span = f"{name} from {along.low:g} to {along.high:g}" if along else "the parameters given"
-    lines = [f"Smith's term of {_named(ndf)}, fitted over {span} and all n·v:", *formula.split("; "),
-             f"largest error of G1 {error:.2g}, of the height-correlated G {pair:.2g}"]
+    lines = [
+        f"Smith's term of {_named(ndf)}, fitted over {span} and all n·v:",
+        *formula.split("; "),
+        f"largest error of G1 {error:.2g}, of the height-correlated G {pair:.2g}",
+    ]
     polynomials = [_horner(values[row].tolist(), name, values.dtype.name) for row in range(shape[0])]
     body = [f"#define NAME_K({name}) ({polynomials[0]})"]
     if scheme == "rational":
-        body += [f"#define NAME_Q({name}) ({polynomials[1]})",
-                 f"#define NAME_A(c, {name}) ((c) + NAME_K({name}) * NAME_Q({name}) * (1.0f - (c)) / "
-                 f"(NAME_Q({name}) + (c)))"]
+        body += [
+            f"#define NAME_Q({name}) ({polynomials[1]})",
+            f"#define NAME_A(c, {name}) ((c) + NAME_K({name}) * NAME_Q({name}) * (1.0f - (c)) / "
+            f"(NAME_Q({name}) + (c)))",
+        ]
     else:
         body += [f"#define NAME_A(c, {name}) ((c) + NAME_K({name}) * (1.0f - (c)))"]
-    body += [f"#define NAME_G1(c, {name}) ((c) / NAME_A(c, {name}))",
-             f"#define NAME_V(NoL, NoV, {name}) (1.0f / ((NoL) * NAME_A(NoV, {name}) + (NoV) * (NAME_A(NoL, {name}) - "
-             "(NoL))))"]
-    return made, {"channels": ["k", "q"][:shape[0]], "formula": formula, "error_pairs": pair,
-                  "variable": name, "text": (lines, body)}
+    body += [
+        f"#define NAME_G1(c, {name}) ((c) / NAME_A(c, {name}))",
+        f"#define NAME_V(NoL, NoV, {name}) (1.0f / ((NoL) * NAME_A(NoV, {name}) + (NoV) * (NAME_A(NoL, {name}) - "
+        "(NoL))))",
+    ]
+    return made, {
+        "channels": ["k", "q"][: shape[0]],
+        "formula": formula,
+        "error_pairs": pair,
+        "variable": name,
+        "text": (lines, body),
+    }
 
 
 def _pairs(scheme: str | None, k: np.ndarray, q: np.ndarray, c: np.ndarray, A: np.ndarray, x: np.ndarray) -> float:
@@ -234,8 +253,10 @@ def norm_check(slots: Mapping[str, Chosen]) -> None:
     """Raise UnsupportedError for an NDF that has no costly norm."""
     entry = slots["ndf"].model
     if not {"norm", "per_norm"} & set(entry.constant_names):
-        raise UnsupportedError(f"norm is of an NDF with a norm that costs: {', '.join(NORM_AXES)} or a .clh file; "
-                               f"{entry.name} has a plain one")
+        raise UnsupportedError(
+            f"norm is of an NDF with a norm that costs: {', '.join(NORM_AXES)} or a .clh file; "
+            f"{entry.name} has a plain one"
+        )
 
 
 def shape_of_norm(axes: Sequence[Axis]) -> tuple[int, ...]:
@@ -261,10 +282,15 @@ def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, An
     def exact(share: Callable[[Axis], np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
         """Parameters and ln norm at shares of the axes, flat."""
         given = {**ndf.given, **cells.columns_at([Points(axis.name, axis.at(share(axis))[0]) for axis in axes])}
-        every = np.broadcast_arrays(*[np.asarray(given.get(f"ndf_{p.name}", given.get(p.name, p.default)), np.float64)
-                                      for p in entry.parameters])
-        rows = np.stack([p.check(one, f"ndf {entry.name}").ravel()
-                         for p, one in zip(entry.parameters, every, strict=True)])
+        every = np.broadcast_arrays(
+            *[
+                np.asarray(given.get(f"ndf_{p.name}", given.get(p.name, p.default)), np.float64)
+                for p in entry.parameters
+            ]
+        )
+        rows = np.stack(
+            [p.check(one, f"ndf {entry.name}").ravel() for p, one in zip(entry.parameters, every, strict=True)]
+        )
         names = [p.name for p in entry.parameters]
         mine = [rows[names.index(axis.name.removeprefix("ndf_"))] for axis in axes]
         return mine, np.log(numbers_of(run.device, entry, rows)[which])
@@ -297,30 +323,51 @@ def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, An
             values[index] = coefficient
         held = np.array([values[index] for index in kept], np.float64)
         there, _ = basis(between, degree)
-        error = max(float(np.abs(np.expm1(matrix @ held - wanted)).max()),
-                    float(np.abs(np.expm1(there @ held - wanted_there)).max()))
+        error = max(
+            float(np.abs(np.expm1(matrix @ held - wanted)).max()),
+            float(np.abs(np.expm1(there @ held - wanted_there)).max()),
+        )
         if error <= run.tolerance:
             break
-    made = Integrated(values, error, wanted.size + wanted_there.size, time.perf_counter() - start,
-                      f"least-largest-degree-{degree}", tuple(missed(error, run.tolerance, run.precision)))
+    made = Integrated(
+        values,
+        error,
+        wanted.size + wanted_there.size,
+        time.perf_counter() - start,
+        f"least-largest-degree-{degree}",
+        tuple(missed(error, run.tolerance, run.precision)),
+    )
     if not report:
         return made, {}
     kind = values.dtype.name
     names = [span.name.removeprefix("ndf_") for span in spans]
-    scaled = [f"({_literal(2 / _width(s), kind)} * {'log' if s.log else ''}({n}) - {_literal(_shift(s), kind)})"
-              for s, n in zip(spans, names, strict=True)]
+    scaled = [
+        f"({_literal(2 / _width(s), kind)} * {'log' if s.log else ''}({n}) - {_literal(_shift(s), kind)})"
+        for s, n in zip(spans, names, strict=True)
+    ]
     rows = values.reshape(len(values), -1)
-    used = [row[:degree + 1 - (i if rows.shape[1] > 1 else 0)].tolist() for i, row in enumerate(rows[:degree + 1])]
+    used = [row[: degree + 1 - (i if rows.shape[1] > 1 else 0)].tolist() for i, row in enumerate(rows[: degree + 1])]
     inner = [_horner(row, "y", kind) for row in used] if rows.shape[1] > 1 else [_literal(row[0], kind) for row in used]
-    body = [f"#define NAME_POLYNOMIAL({', '.join('xy'[:len(names)])}) ({_nested(inner, 'x')})",
-            f"#define NAME_NORM({', '.join(names)}) exp(NAME_POLYNOMIAL({', '.join(scaled)}))"]
+    body = [
+        f"#define NAME_POLYNOMIAL({', '.join('xy'[: len(names)])}) ({_nested(inner, 'x')})",
+        f"#define NAME_NORM({', '.join(names)}) exp(NAME_POLYNOMIAL({', '.join(scaled)}))",
+    ]
     formula = f"D = norm · {LOBES.get(entry.name, 'the lobe')}; ln norm is a polynomial of degree {degree}"
-    lines = [f"The norm of {_named(ndf)} for " +
-             ", ".join(f"{n} from {s.low:g} to {s.high:g}" for n, s in zip(names, spans, strict=True)) +
-             f"; largest relative error {error:.2g}", formula]
-    return made, {"formula": formula, "degree": degree, "text": (lines, body),
-                  "spans": [{"name": n, "from": s.low, "to": s.high, "scale": "log" if s.log else "linear"}
-                            for n, s in zip(names, spans, strict=True)]}
+    lines = [
+        f"The norm of {_named(ndf)} for "
+        + ", ".join(f"{n} from {s.low:g} to {s.high:g}" for n, s in zip(names, spans, strict=True))
+        + f"; largest relative error {error:.2g}",
+        formula,
+    ]
+    return made, {
+        "formula": formula,
+        "degree": degree,
+        "text": (lines, body),
+        "spans": [
+            {"name": n, "from": s.low, "to": s.high, "scale": "log" if s.log else "linear"}
+            for n, s in zip(names, spans, strict=True)
+        ],
+    }
 
 
 def _width(span: Span) -> float:
@@ -361,6 +408,16 @@ def header(name: str, text: tuple[Sequence[str], Sequence[str]], version: str) -
     """The text of a .h for C and GLSL, its macros named after `name`."""
     lines, body = text
     guard = f"{name.upper()}_H"
-    return "\n".join([*(f"// {line}" for line in lines), f"// Made by whitefurnace {version}.", f"#ifndef {guard}",
-                      f"#define {guard}", "", *(line.replace("NAME_", f"{name.upper()}_") for line in body), "",
-                      f"#endif  // {guard}", ""])
+    return "\n".join(
+        [
+            *(f"// {line}" for line in lines),
+            f"// Made by whitefurnace {version}.",
+            f"#ifndef {guard}",
+            f"#define {guard}",
+            "",
+            *(line.replace("NAME_", f"{name.upper()}_") for line in body),
+            "",
+            f"#endif  // {guard}",
+            "",
+        ]
+    )

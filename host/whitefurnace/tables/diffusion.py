@@ -3,6 +3,7 @@
 Written in numpy and not as a kernel: for each curvature the integral is a sum of a few hundred values of the profile
 with weights that no row changes, so a table is one product of two matrices.
 """
+
 from __future__ import annotations
 
 import time
@@ -24,8 +25,14 @@ AXES = ("NoL", "curvature")
 CHANNELS = ("r", "g", "b")
 OF_COEFFICIENTS = ("absorption", "scattering")
 OF_ALBEDO = ("albedo", "mfp")
-DOMAINS = {"absorption": (0.0, 1e6), "scattering": (0.0, 1e6), "albedo": (1e-3, 1.0), "mfp": (1e-9, 1e9),
-           "g": (-0.99, 0.99), "ior": (1.0, 3.0)}
+DOMAINS = {
+    "absorption": (0.0, 1e6),
+    "scattering": (0.0, 1e6),
+    "albedo": (1e-3, 1.0),
+    "mfp": (1e-9, 1e9),
+    "g": (-0.99, 0.99),
+    "ior": (1.0, 3.0),
+}
 
 NODES = (14, 20)
 """Gauss nodes of a panel: of the rule for the error estimate, and of the rule whose values are kept."""
@@ -54,8 +61,9 @@ def profile(scheme: str | None, given: Mapping[str, float]) -> Profile:
         _only((), given, scheme)
         return _dipole(MEDIA[scheme])
     groups = (OF_ALBEDO, OF_COEFFICIENTS) if scheme == "burley" else (OF_COEFFICIENTS,)
-    names = {f"{name}{suffix}" for group in groups for name in group for suffix in
-             ("", *(f"_{c}" for c in CHANNELS))} | {"g", "ior"}
+    names = {
+        f"{name}{suffix}" for group in groups for name in group for suffix in ("", *(f"_{c}" for c in CHANNELS))
+    } | {"g", "ior"}
     _only(names, given, scheme)
     for name, value in given.items():
         low, high = DOMAINS[name.rsplit("_", 1)[0]]
@@ -64,8 +72,9 @@ def profile(scheme: str | None, given: Mapping[str, float]) -> Profile:
     if scheme == "burley":
         either = [{name for name in given if name.split("_")[0] in group} for group in groups]
         if all(either) or not any(either) or (either[0] and {"g", "ior"} & set(given)):
-            raise UsageError("burley is of albedo and mfp, or of absorption, scattering, g and ior: give one or the "
-                             "other")
+            raise UsageError(
+                "burley is of albedo and mfp, or of absorption, scattering, g and ior: give one or the other"
+            )
         if either[0]:
             return Burley(_rgb("mfp", given, 1.0) / shape(_rgb("albedo", given)))
     absorption, scattering = ([float(1e3 * v) for v in _rgb(name, given)] for name in OF_COEFFICIENTS)
@@ -116,9 +125,19 @@ def _parts(scheme: str | None, columns: Mapping[str, np.ndarray]) -> tuple[np.nd
     return NoL, curvature, found
 
 
-def diffusion(scheme: str | None, report: bool, *, out: np.ndarray | None, precision: int, tolerance: float,
-              NoL: np.ndarray, curvature: np.ndarray, device: Any = None, backfacing: str | None = None,
-              **others: np.ndarray) -> tuple[Integrated, dict[str, Any]]:
+def diffusion(
+    scheme: str | None,
+    report: bool,
+    *,
+    out: np.ndarray | None,
+    precision: int,
+    tolerance: float,
+    NoL: np.ndarray,
+    curvature: np.ndarray,
+    device: Any = None,
+    backfacing: str | None = None,
+    **others: np.ndarray,
+) -> tuple[Integrated, dict[str, Any]]:
     """Diffuse light D (…, 3) by the cosine NoL of the light and the curvature κ in 1/mm.
 
     D(θ, κ) = ∫ q(2 sin(x/2)/κ) max(cos(θ + x), 0) dx / ∫ q dx over x from -π to π, θ = acos NoL.
@@ -135,13 +154,20 @@ def diffusion(scheme: str | None, report: bool, *, out: np.ndarray | None, preci
     values = room_for((*which[0].shape, 3), precision, out)
     values[...] = table[which]
     error += LEFT[precision]
-    made = Integrated(values, error, 3 * nodes * bends[0].size, time.perf_counter() - start,
-                      f"gauss-panels-{NODES[1]}", tuple(missed(error, tolerance, precision)))
+    made = Integrated(
+        values,
+        error,
+        3 * nodes * bends[0].size,
+        time.perf_counter() - start,
+        f"gauss-panels-{NODES[1]}",
+        tuple(missed(error, tolerance, precision)),
+    )
     return made, {
-        "channels": ["R", "G", "B"], "units": {"curvature": "1/mm"},
+        "channels": ["R", "G", "B"],
+        "units": {"curvature": "1/mm"},
         "profile": _stated(found),
         "formula": "diffuse = albedo D(n·l, curvature) times the irradiance facing the light; a flat body has "
-                   "max(n·l, 0)",
+        "max(n·l, 0)",
     } if report else {}
 
 
@@ -168,15 +194,14 @@ def integrated(found: Profile, NoL: np.ndarray, curvature: np.ndarray) -> tuple[
         columns = slice(first, first + COLUMNS)
         rules = [_rule(NoL[columns], halvings, nodes) for nodes in NODES]
         for begin in range(0, bent.size, ROWS):
-            rows = bent[begin:begin + ROWS]
+            rows = bent[begin : begin + ROWS]
             D = [_ratio(found, 1 / curvature[rows], *rule) for rule in rules]
             error = max(error, float(np.abs(D[1] - D[0]).max()))
             values[rows, columns] = D[1]
     return values, error, (halvings + 1) * NODES[1]
 
 
-def _ratio(found: Profile, radii: np.ndarray, x: np.ndarray, share: np.ndarray,
-           weights: np.ndarray) -> np.ndarray:
+def _ratio(found: Profile, radii: np.ndarray, x: np.ndarray, share: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(rows, columns, 3) by the nodes x, `share` (columns, nodes) of the integral and `weights` of the whole."""
     q = found.line_spread(2 * radii[:, None] * np.sin(x / 2))
     D = np.einsum("cx,rxk->rck", share, q, optimize=True) / np.einsum("x,rxk->rk", weights, q)[:, None]
@@ -220,7 +245,8 @@ def _up_to(at: np.ndarray, ends: np.ndarray, x: np.ndarray, weight: np.ndarray) 
     found = []
     for trig in (np.cos, np.sin):
         total = whole * trig(x)
-        total[np.arange(at.size), panel] += np.einsum("aq,aqk->ak", span[:, None] * w * trig(ends[panel, None] + inner),
-                                                      basis)
+        total[np.arange(at.size), panel] += np.einsum(
+            "aq,aqk->ak", span[:, None] * w * trig(ends[panel, None] + inner), basis
+        )
         found.append(total.reshape(at.size, -1))
     return found[0], found[1]

@@ -1,5 +1,6 @@
 """The energy that single scattering loses, in the forms of three schemes that restore it; the albedo of sheen; and the
 average of a Fresnel term."""
+
 from __future__ import annotations
 
 import time
@@ -50,8 +51,10 @@ def _albedos(what: Mapping[str, Any]) -> tuple[Integrated, Integrated]:
     average = {k: v for k, v in _without_view(own).items() if k != "backfacing"}
     E, mean = integrate("albedo", **own), integrate("albedo_average", **average)
     if E.values.max() > 1 + 1e-6:
-        raise UnsupportedError(f"single scattering with this masking reflects up to {E.values.max():.4g} of what "
-                               "arrives: there is no loss to give back; smith has albedos of at most 1")
+        raise UnsupportedError(
+            f"single scattering with this masking reflects up to {E.values.max():.4g} of what "
+            "arrives: there is no loss to give back; smith has albedos of at most 1"
+        )
     return E, mean
 
 
@@ -65,10 +68,13 @@ def _whole(out: np.ndarray | None, channels: Sequence[np.ndarray], precision: in
 
 def _joined(first: Integrated, *others: Integrated) -> Integrated:
     """The statements of several integrals in one."""
-    return replace(first, error=max(one.error for one in (first, *others)),
-                   evaluations=sum(one.evaluations for one in (first, *others)),
-                   seconds=sum(one.seconds for one in (first, *others)),
-                   notices=tuple(dict.fromkeys(n for one in (first, *others) for n in one.notices)))
+    return replace(
+        first,
+        error=max(one.error for one in (first, *others)),
+        evaluations=sum(one.evaluations for one in (first, *others)),
+        seconds=sum(one.seconds for one in (first, *others)),
+        notices=tuple(dict.fromkeys(n for one in (first, *others) for n in one.notices)),
+    )
 
 
 def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
@@ -82,10 +88,16 @@ def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str
     """
     E, mean = _albedos(what)
     lost, lost_avg = np.maximum(1 - E.values, 0), np.maximum(1 - mean.values, 0)
-    pairs = integrate("dfg", **{**what, "precision": 32, "tolerance": PAIRS, "out": None}) if \
-        report or scheme == "fdez_aguera" else None
-    channels = {"kulla_conty": lambda: (lost, lost_avg), "turquin": lambda: (E.values, lost / E.values),
-                "fdez_aguera": lambda: (pairs.values[..., 0], pairs.values[..., 1])}[scheme]()  # type: ignore[union-attr]
+    pairs = (
+        integrate("dfg", **{**what, "precision": 32, "tolerance": PAIRS, "out": None})
+        if report or scheme == "fdez_aguera"
+        else None
+    )
+    channels = {
+        "kulla_conty": lambda: (lost, lost_avg),
+        "turquin": lambda: (E.values, lost / E.values),
+        "fdez_aguera": lambda: (pairs.values[..., 0], pairs.values[..., 1]),
+    }[scheme]()  # type: ignore[union-attr]
     values = _whole(what["out"], channels, what["precision"])
     parts = [pairs] if scheme == "fdez_aguera" and pairs else [E, mean]
     made = replace(_joined(*parts), values=values)
@@ -95,8 +107,10 @@ def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str
         return made, {}
     # The average again, in μ = x³: the furnace must not be judged by the nodes that made the table.
     x, w = gauss(CHECK)
-    columns: dict[str, Any] = {k: np.asarray(v)[..., None] if isinstance(v, np.ndarray) and np.ndim(v) else v
-               for k, v in _without_view(what).items()}
+    columns: dict[str, Any] = {
+        k: np.asarray(v)[..., None] if isinstance(v, np.ndarray) and np.ndim(v) else v
+        for k, v in _without_view(what).items()
+    }
     columns |= {"NoV": x**3, "precision": 64, "tolerance": FINE, "out": None}
     along = integrate("albedo", **columns).values
     again = ((1 - along) * (6 * w * x**5)).sum(-1)
@@ -117,13 +131,18 @@ def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str
 
     apart = {"kulla_conty": 0.0, "turquin": _apart(E.values), "fdez_aguera": _apart(lost)}[scheme]
     return made, {
-        "channels": {"kulla_conty": ["1 - E", "1 - E_avg"], "turquin": ["E", "1/E - 1"],
-                     "fdez_aguera": ["scale", "bias"]}[scheme],
-        "formula": {"kulla_conty": "f + F_ms (1 - E(l)) (1 - E(v)) / (π (1 - E_avg)), "
-                                   "F_ms = F_avg² E_avg / (1 - F_avg (1 - E_avg))",
-                    "turquin": "f (1 + F0 (1/E(v) - 1))",
-                    "fdez_aguera": "S radiance + S F_avg (1 - E) / (1 - F_avg (1 - E)) irradiance/π, "
-                                   "S = F0 scale + bias, E = scale + bias, F_avg = F0 + (1 - F0)/21"}[scheme],
+        "channels": {
+            "kulla_conty": ["1 - E", "1 - E_avg"],
+            "turquin": ["E", "1/E - 1"],
+            "fdez_aguera": ["scale", "bias"],
+        }[scheme],
+        "formula": {
+            "kulla_conty": "f + F_ms (1 - E(l)) (1 - E(v)) / (π (1 - E_avg)), "
+            "F_ms = F_avg² E_avg / (1 - F_avg (1 - E_avg))",
+            "turquin": "f (1 + F0 (1/E(v) - 1))",
+            "fdez_aguera": "S radiance + S F_avg (1 - E) / (1 - F_avg (1 - E)) irradiance/π, "
+            "S = F0 scale + bias, E = scale + bias, F_avg = F0 + (1 - F0)/21",
+        }[scheme],
         "furnace": float(np.abs(furnace(scheme, 1.0) - 1).max()),
         "non_reciprocity": apart,
         "deviation": {f"{f0:g}": float(np.abs(furnace(scheme, f0) - furnace("kulla_conty", f0)).max()) for f0 in F0},
@@ -145,11 +164,16 @@ def sheen(report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
     E = integrate("albedo", **own)
     mean = integrate("albedo_average", **{k: v for k, v in _without_view(own).items() if k != "backfacing"})
     if report and E.values.max() > 1 + E.error:
-        raise UnsupportedError(f"a sheen that reflects {E.values.max():.4g} of what arrives leaves less than nothing "
-                               "to what lies under it; smith has albedos of at most 1")
+        raise UnsupportedError(
+            f"a sheen that reflects {E.values.max():.4g} of what arrives leaves less than nothing "
+            "to what lies under it; smith has albedos of at most 1"
+        )
     made = replace(_joined(E, mean), values=_whole(what["out"], (E.values, mean.values), what["precision"]))
-    return made, {"channels": ["E", "E_avg"], "largest": float(E.values.max()),
-                  "formula": "f_sheen + f_base min(1 - s E(v), 1 - s E(l)), s the largest channel of its colour"}
+    return made, {
+        "channels": ["E", "E_avg"],
+        "largest": float(E.values.max()),
+        "formula": "f_sheen + f_base min(1 - s E(v), 1 - s E(l)), s the largest channel of its colour",
+    }
 
 
 def _grid(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> Grid:
@@ -159,12 +183,17 @@ def _grid(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> Grid:
 def fresnel_spec(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> TableSpec:
     """The shape and the kernels of `fresnel_average`. Raises UsageError for parameters outside their domain."""
     slots = {"fresnel": models["fresnel"].model}
-    return TableSpec(integral("albedo_average"), models, _grid(models, columns).shape,
-                  (source.evaluation("FRESNEL_F", slots).digest,))
+    return TableSpec(
+        integral("albedo_average"),
+        models,
+        _grid(models, columns).shape,
+        (source.evaluation("FRESNEL_F", slots).digest,),
+    )
 
 
-def _halved(F: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int,
-            rounding: float) -> tuple[np.ndarray, float, int]:
+def _halved(
+    F: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int, rounding: float
+) -> tuple[np.ndarray, float, int]:
     """2∫ F μ dμ of `count` curves F(μ, which), the error left and the evaluations: panels of 10 Gauss nodes, halved
     where their halves say otherwise, so that a kink (total reflection) is closed in upon;
     `rounding` is that of F."""
@@ -193,8 +222,16 @@ def _halved(F: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int,
     return total, float(left.max()), used
 
 
-def fresnel_average(*, fresnel: Chosen, out: np.ndarray | None, precision: int, tolerance: float, device: Device,
-                    backfacing: str | None = None, **columns: Any) -> Integrated:
+def fresnel_average(
+    *,
+    fresnel: Chosen,
+    out: np.ndarray | None,
+    precision: int,
+    tolerance: float,
+    device: Device,
+    backfacing: str | None = None,
+    **columns: Any,
+) -> Integrated:
     """The average F_avg = 2∫ F(μ) μ dμ, (…), to 1e-6 or better."""
     start, entry = time.perf_counter(), fresnel.model
     slots, grid = {"fresnel": entry}, _grid({"fresnel": fresnel}, columns)
@@ -214,6 +251,11 @@ def fresnel_average(*, fresnel: Chosen, out: np.ndarray | None, precision: int, 
         flat[begin:end] = found
         error, evaluations = max(error, left), evaluations + used
     error += 1e-7 * float(np.abs(flat).max()) if 32 in (precision, finest) else 1e-15  # of the format
-    return Integrated(values, error, evaluations, time.perf_counter() - start, "gauss-halved-10",
-                      tuple(missed(error, tolerance, precision)))
-
+    return Integrated(
+        values,
+        error,
+        evaluations,
+        time.perf_counter() - start,
+        "gauss-halved-10",
+        tuple(missed(error, tolerance, precision)),
+    )

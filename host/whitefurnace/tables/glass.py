@@ -1,5 +1,6 @@
 """Rough glass: the shares of light that a boundary of two insulators reflects and transmits, by view, roughness and
 index of refraction."""
+
 from __future__ import annotations
 
 import time
@@ -54,8 +55,10 @@ def check(slots: Mapping[str, Chosen]) -> None:
     if not ndf.isotropic:
         raise UnsupportedError(f"glass wants an isotropic ndf; {ndf.name} is anisotropic")
     if "MASKING_G1" not in masking.provides:
-        raise UnsupportedError(f"glass wants a masking of each direction alone, for light on either side; "
-                               f"{masking.name} is none: smith and smith_separable are")
+        raise UnsupportedError(
+            f"glass wants a masking of each direction alone, for light on either side; "
+            f"{masking.name} is none: smith and smith_separable are"
+        )
 
 
 def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
@@ -63,9 +66,20 @@ def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
     return (source.refraction({slot: choice.model for slot, choice in slots.items()}).digest,)
 
 
-def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fresnel: Chosen, out: np.ndarray | None,
-          precision: int, tolerance: float, device: Device, backfacing: str | None = None,
-          **columns: Any) -> tuple[Integrated, dict[str, Any]]:
+def glass(
+    scheme: str | None,
+    report: bool,
+    *,
+    ndf: Chosen,
+    masking: Chosen,
+    fresnel: Chosen,
+    out: np.ndarray | None,
+    precision: int,
+    tolerance: float,
+    device: Device,
+    backfacing: str | None = None,
+    **columns: Any,
+) -> tuple[Integrated, dict[str, Any]]:
     """Shares R and T (…, 2) of the energy that arrives along v, for single scattering. [Walter2007]
 
     scheme: "entering" for light from the side of index 1, "leaving" for light from the other side, where Fresnel's n is
@@ -79,8 +93,12 @@ def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fre
     grid = grid_of(REFRACTION, slots, dict(columns), backfacing)
     n = 1 / grid.columns["fresnel_ior"] if scheme == "leaving" else grid.columns["fresnel_ior"]
     grid = Grid(grid.shape, {**grid.columns, "fresnel_ior": n})
-    part = Boundary(device, REFRACTION, {slot: choice.model for slot, choice in slots.items()},
-                    32 if tolerance >= TOLERANCE else finest(device))
+    part = Boundary(
+        device,
+        REFRACTION,
+        {slot: choice.model for slot, choice in slots.items()},
+        32 if tolerance >= TOLERANCE else finest(device),
+    )
     left = tolerance - (LOST if part.precision == 32 else 0.0)
     values = room_for((*grid.shape, 2), precision, out)
     flat, totals = values.reshape(grid.size, 2), Totals()
@@ -88,8 +106,16 @@ def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fre
     whole, error = None, 0.0
     if (n < 1).any():
         plain = {name: value for name, value in columns.items() if name not in ("ior", "fresnel_ior")}
-        whole = integrate("albedo", ndf=ndf, masking=masking, precision=finest(device), tolerance=tolerance / 4,
-                          backfacing=backfacing, device=device, **plain)
+        whole = integrate(
+            "albedo",
+            ndf=ndf,
+            masking=masking,
+            precision=finest(device),
+            tolerance=tolerance / 4,
+            backfacing=backfacing,
+            device=device,
+            **plain,
+        )
         error = whole.error
     for begin in range(0, grid.size, CELLS_A_LAUNCH):
         end = min(begin + CELLS_A_LAUNCH, grid.size)
@@ -101,16 +127,27 @@ def glass(scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen, fre
         flat[begin:end] = found.T
     error += totals.error
     notices = (*totals.notices(), *missed(error, tolerance, precision))
-    made = Integrated(values, error, totals.evaluations + (whole.evaluations if whole else 0),
-                      time.perf_counter() - start, totals.rule.name if totals.rule else "", notices)
+    made = Integrated(
+        values,
+        error,
+        totals.evaluations + (whole.evaluations if whole else 0),
+        time.perf_counter() - start,
+        totals.rule.name if totals.rule else "",
+        notices,
+    )
     if not report:
         return made, {}
     both = flat.sum(1, dtype=np.float64)
-    return made, {"channels": ["reflected", "transmitted"], "largest": float(both.max()), "least": float(both.min()),
-                  "formula": "shares of the energy that arrives along v, once scattered; both scaled by "
-                             "1/(reflected + transmitted) they keep all of it",
-                  "side": "light from the side of index 1" if scheme == "entering" else
-                          "light from the side of index ior: Fresnel's n is 1/ior"}
+    return made, {
+        "channels": ["reflected", "transmitted"],
+        "largest": float(both.max()),
+        "least": float(both.min()),
+        "formula": "shares of the energy that arrives along v, once scattered; both scaled by "
+        "1/(reflected + transmitted) they keep all of it",
+        "side": "light from the side of index 1"
+        if scheme == "entering"
+        else "light from the side of index ior: Fresnel's n is 1/ior",
+    }
 
 
 def _beside(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

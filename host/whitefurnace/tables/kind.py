@@ -3,6 +3,7 @@
 This module and those in `tables/kinds` load neither numpy nor a device, since `--help` lists the kinds: what computes a
 table is imported inside the methods that need it.
 """
+
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
@@ -91,8 +92,9 @@ class Kind:
         """The models that the table is of, by slot. Raises UnsupportedError for those that it cannot be of."""
         if not (request.fresnel is None and request.diffuse is None and request.brdf is None):
             shown = "1" if self.fresnel == "one" else self.fresnel
-            raise UnsupportedError(f"{self.name} is of an NDF and its masking; Fresnel's term is {shown}, and nothing "
-                                   "else is added")
+            raise UnsupportedError(
+                f"{self.name} is of an NDF and its masking; Fresnel's term is {shown}, and nothing else is added"
+            )
         ndf = self.ndf if request.ndf is None else request.ndf
         return {"ndf": ndf, "masking": request.masking or "smith", "fresnel": self.fresnel}
 
@@ -113,8 +115,9 @@ class Kind:
 
         return centred(size)
 
-    def with_usual_axes(self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float],
-                        size: Size) -> dict[str, AxisSpec]:
+    def with_usual_axes(
+        self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float], size: Size
+    ) -> dict[str, AxisSpec]:
         """The axes given, and those that the table has beside the default ones and that are neither given nor fixed."""
         from whitefurnace.tables.axes import usual_beside
 
@@ -133,7 +136,7 @@ class Kind:
         from whitefurnace.integrals.quadrature import table_spec
 
         found = table_spec(self.integral(cells.scheme), **cells.arguments)
-        return replace(found, shape=(*found.shape[:len(cells.shape)], self.channels))
+        return replace(found, shape=(*found.shape[: len(cells.shape)], self.channels))
 
     def make(self, cells: Cells, run: Run, report: bool) -> tuple[Integrated, Facts]:
         """The values of the cells, […, channel], and what is stated of them if `report`; otherwise nothing."""

@@ -14,6 +14,7 @@ What is minimized and stated is the misplaced energy m = ∫ |f (n·l)/E - p| d�
 radiance up to 1 is reflected wrongly by E m/2 at most. 0 is exact, 2 is nothing in common. A fit of the third power of
 the difference, as the public one, sees little of m: its table has .124, and its form can do .114 (64², GGX, Smith).
 """
+
 from __future__ import annotations
 
 import time
@@ -81,9 +82,21 @@ class Lobes:
     def descend(self, N: np.ndarray, which: np.ndarray, rule: Rule, soft: float) -> np.ndarray:
         """(19, n) of the kernel `descend` at matrices (4, n) = xx, xz, zx, zz of the cells `which`."""
         polar, azimuthal = rule.tables()
-        return over_cells(self.device, self.text, "descend", self._cells(N, which), 19, self.precision, [
-            *map(np.int32, rule.counts), polar, np.int32(rule.azimuths), azimuthal,
-            np.dtype(f"f{self.precision // 8}").type(soft)]).astype(np.float64)
+        return over_cells(
+            self.device,
+            self.text,
+            "descend",
+            self._cells(N, which),
+            19,
+            self.precision,
+            [
+                *map(np.int32, rule.counts),
+                polar,
+                np.int32(rule.azimuths),
+                azimuthal,
+                np.dtype(f"f{self.precision // 8}").type(soft),
+            ],
+        ).astype(np.float64)
 
     def misplaced(self, N: np.ndarray) -> np.ndarray:
         """(n,): m of matrices (4, n), by nodes of the lobe itself: not those of the fit. 2 where there is no lobe."""
@@ -92,8 +105,15 @@ class Lobes:
         polar, azimuthal = (np.stack(gauss(n), 1) for n in EXACT)
         found = np.full(self.count, 2.0)
         if some.size:
-            found[some] = over_cells(self.device, self.text, "misplaced", self._cells(N[:, some], some), 3,
-                                     self.precision, [np.int32(EXACT[0]), polar, np.int32(EXACT[1]), azimuthal])[0]
+            found[some] = over_cells(
+                self.device,
+                self.text,
+                "misplaced",
+                self._cells(N[:, some], some),
+                3,
+                self.precision,
+                [np.int32(EXACT[0]), polar, np.int32(EXACT[1]), azimuthal],
+            )[0]
         return np.minimum(found, 2.0)  # no more can be, but for what nodes leave of lobes far apart
 
 
@@ -159,8 +179,11 @@ def descend(lobes: Lobes, fit: Fit, which: np.ndarray, free: bool, stage: tuple[
             break
         A = curve[:, kept[:, None], kept]
         diagonal = np.einsum("nii->ni", A)
-        A = A + np.einsum("ni,ij->nij", damping[:, None] * (diagonal + 1e-6 * diagonal.max(1, keepdims=True) + 1e-30),
-                          np.eye(kept.size))
+        A = A + np.einsum(
+            "ni,ij->nij",
+            damping[:, None] * (diagonal + 1e-6 * diagonal.max(1, keepdims=True) + 1e-30),
+            np.eye(kept.size),
+        )
         step = np.zeros((at.size, 4))
         step[:, kept] = -np.linalg.solve(A, slope[:, kept, None])[..., 0]
         step *= np.minimum(1, STEP / np.maximum(np.abs(step).max(1), 1e-30))[:, None]
@@ -261,12 +284,16 @@ def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
     models = {slot: slots[slot].model for slot in ("ndf", "masking", "fresnel")}
     pair, both = integral("dfg"), {slot: models[slot] for slot in ("ndf", "masking")}
     closed = own_kernel_of(pair, both)
-    return (source.transformed(models).digest, source.integration(pair, both).digest,
-            *([source.closed(closed, both).digest] if closed else []))
+    return (
+        source.transformed(models).digest,
+        source.integration(pair, both).digest,
+        *([source.closed(closed, both).digest] if closed else []),
+    )
 
 
-def lobes_of(device: Device, models: Mapping[str, Chosen], albedo: np.ndarray,
-             columns: Mapping[str, Any]) -> tuple[Lobes, np.ndarray]:
+def lobes_of(
+    device: Device, models: Mapping[str, Chosen], albedo: np.ndarray, columns: Mapping[str, Any]
+) -> tuple[Lobes, np.ndarray]:
     """The cells of a grid of parameters with known albedos, and the angular widths (n,) of their NDF in radians."""
     entry, precision = integral("albedo"), finest(device)
     slots = {slot: models[slot] for slot in ("ndf", "masking", "fresnel")}
@@ -276,9 +303,11 @@ def lobes_of(device: Device, models: Mapping[str, Chosen], albedo: np.ndarray,
     per = 1 / np.maximum(np.asarray(albedo, np.float64).ravel(), 1e-30)
     rows = np.concatenate([cells[:1], per[None], np.zeros((4, grid.size)), cells[1:]])
     ndf = part.slots["ndf"]
-    width = evaluate(device, "NDF_WIDTH", {"ndf": ndf}, cells[1:1 + len(ndf.arguments)], precision)[0]
-    return (Lobes(device, source.transformed(part.slots, terms).text, rows, precision),
-            np.clip(width.astype(np.float64), 1e-6, 1.0))
+    width = evaluate(device, "NDF_WIDTH", {"ndf": ndf}, cells[1 : 1 + len(ndf.arguments)], precision)[0]
+    return (
+        Lobes(device, source.transformed(part.slots, terms).text, rows, precision),
+        np.clip(width.astype(np.float64), 1e-6, 1.0),
+    )
 
 
 def sphere_form_factor(z: np.ndarray, length: np.ndarray) -> np.ndarray:
@@ -296,15 +325,20 @@ def sphere_form_factor(z: np.ndarray, length: np.ndarray) -> np.ndarray:
     gamma = np.arctan2(sin_g, cos_g)
     rim = -2 * sin_w * cos_s * cos_g + np.pi / 2 - gamma + sin_g * cos_g
     per = np.where(cut, sin_s, 1)
-    side = np.abs(z) * (cos_g * np.sqrt(np.maximum(sin_s**2 - cos_g**2, 0)) +
-                        sin_s**2 * np.arcsin(np.minimum(cos_g / per, 1)))
+    side = np.abs(z) * (
+        cos_g * np.sqrt(np.maximum(sin_s**2 - cos_g**2, 0)) + sin_s**2 * np.arcsin(np.minimum(cos_g / per, 1))
+    )
     area = np.pi * np.maximum(z, 0) * length + rim - side
     return np.where(cut, area / (np.pi * np.where(cut, length, 1)), np.maximum(z, 0))
 
 
 def _stated(m: np.ndarray) -> dict[str, float]:
-    return {"mean": float(m.mean()), "median": float(np.median(m)), "p99": float(np.quantile(m, 0.99)),
-            "max": float(m.max())}
+    return {
+        "mean": float(m.mean()),
+        "median": float(np.median(m)),
+        "p99": float(np.quantile(m, 0.99)),
+        "max": float(m.max()),
+    }
 
 
 def _stored(N: np.ndarray, kind: str) -> np.ndarray:
@@ -319,18 +353,32 @@ def _four(values: np.ndarray) -> np.ndarray:
     return (down[..., 1:] + down[..., :-1]) / 2
 
 
-def matrices(scheme: str, device: Device, models: Mapping[str, Chosen], albedo: np.ndarray,
-             columns: Mapping[str, Any]) -> tuple[np.ndarray, Lobes]:
+def matrices(
+    scheme: str, device: Device, models: Mapping[str, Chosen], albedo: np.ndarray, columns: Mapping[str, Any]
+) -> tuple[np.ndarray, Lobes]:
     """The fitted matrices (4, …), float64, as xx, xz, zx, zz over the broadcast parameters, and their cells."""
     lobes, width = lobes_of(device, models, albedo, columns)
     fit = fit_lobes(lobes, np.shape(albedo), width, scheme)
     return fit.N.reshape(4, *np.shape(albedo)), lobes
 
 
-def ltc(kind: str, names: Sequence[str], scheme: str | None, report: bool, *, ndf: Chosen, masking: Chosen,
-        fresnel: Chosen, device: Device, precision: int, tolerance: float, out: np.ndarray | None,
-        backfacing: str | None = None, middle: Mapping[str, Any] | None = None,
-        **columns: Any) -> tuple[Integrated, dict[str, Any]]:
+def ltc(
+    kind: str,
+    names: Sequence[str],
+    scheme: str | None,
+    report: bool,
+    *,
+    ndf: Chosen,
+    masking: Chosen,
+    fresnel: Chosen,
+    device: Device,
+    precision: int,
+    tolerance: float,
+    out: np.ndarray | None,
+    backfacing: str | None = None,
+    middle: Mapping[str, Any] | None = None,
+    **columns: Any,
+) -> tuple[Integrated, dict[str, Any]]:
     """The channels `names` of a table, (…, c), and what is stated of it if `report`.
 
     ltc_1 holds the matrix, ltc_2 (norm, Fresnel, 0, sphere), ltc both.
@@ -341,15 +389,24 @@ def ltc(kind: str, names: Sequence[str], scheme: str | None, report: bool, *, nd
     """
     start = time.perf_counter()
     models = {"ndf": ndf, "masking": masking, "fresnel": fresnel}
-    pairs = integrate("dfg", ndf=ndf, masking=masking, device=device, precision=finest(device), backfacing=backfacing,
-                      tolerance=max(tolerance / 2, 1e-9), **columns)
+    pairs = integrate(
+        "dfg",
+        ndf=ndf,
+        masking=masking,
+        device=device,
+        precision=finest(device),
+        backfacing=backfacing,
+        tolerance=max(tolerance / 2, 1e-9),
+        **columns,
+    )
     norm = pairs.values.sum(-1, dtype=np.float64)
     channels = {"norm": norm, "fresnel": pairs.values[..., 1], "0": np.zeros(norm.shape)}
     facts: dict[str, Any] = {"channels": list(names)}
     if "sphere" in names:
         rows, across = norm.shape[-2:]
-        channels["sphere"] = np.broadcast_to(sphere_form_factor(
-            np.linspace(-1, 1, across), np.linspace(0, 1, rows)[:, None]), norm.shape)
+        channels["sphere"] = np.broadcast_to(
+            sphere_form_factor(np.linspace(-1, 1, across), np.linspace(0, 1, rows)[:, None]), norm.shape
+        )
     if "xx" in names:
         if backfacing is not None:
             raise UnsupportedError(f"{kind} has no views from behind: leave backfacing out")
@@ -364,20 +421,37 @@ def ltc(kind: str, names: Sequence[str], scheme: str | None, report: bool, *, nd
     return replace(pairs, values=values, error=2 * pairs.error, seconds=time.perf_counter() - start), facts
 
 
-def _facts(N: np.ndarray, lobes: Lobes, models: Mapping[str, Chosen], middle: Mapping[str, Any] | None,
-           precision: int, device: Device) -> dict[str, Any]:
+def _facts(
+    N: np.ndarray,
+    lobes: Lobes,
+    models: Mapping[str, Chosen],
+    middle: Mapping[str, Any] | None,
+    precision: int,
+    device: Device,
+) -> dict[str, Any]:
     """What is misplaced by the matrices as formats hold them, and by what is read in the middle of four texels."""
     flat, name = N.reshape(4, -1), f"float{precision}"
     kinds = {name: f"f{precision // 8}", "float16": "f2"}
     stated: dict[str, Any] = {held: _stated(lobes.misplaced(_stored(flat, kind))) for held, kind in kinds.items()}
     if middle is not None:
-        albedo = integrate("albedo", ndf=models["ndf"], masking=models["masking"], device=device,
-                           precision=lobes.precision, tolerance=1e-6, **middle)
+        albedo = integrate(
+            "albedo",
+            ndf=models["ndf"],
+            masking=models["masking"],
+            device=device,
+            precision=lobes.precision,
+            tolerance=1e-6,
+            **middle,
+        )
         between, _ = lobes_of(device, models, albedo.values, middle)
-        stated["between"] = {held: _stated(between.misplaced(_four(_stored(N, kind)).reshape(4, -1)))
-                           for held, kind in kinds.items()}
+        stated["between"] = {
+            held: _stated(between.misplaced(_four(_stored(N, kind)).reshape(4, -1))) for held, kind in kinds.items()
+        }
     below = horizon(flat)[0]
-    return {"misplaced": stated, "below_horizon": {"mean": float(below.mean()), "max": float(below.max())},
-            "formula": "p(ω) = det N max(w.z, 0)/(π |w|⁴), w = (xx ω.x + xz ω.z, ω.y, zx ω.x + zz ω.z), v = (sin θ, 0, "
-                       "cos θ); reflected: (F0 norm + (1 - F0) fresnel) ∫ p L dω",
-            "misplaced_is": "∫ |f (n·l)/norm - p| dω over the sphere, by nodes that the fit has not"}
+    return {
+        "misplaced": stated,
+        "below_horizon": {"mean": float(below.mean()), "max": float(below.max())},
+        "formula": "p(ω) = det N max(w.z, 0)/(π |w|⁴), w = (xx ω.x + xz ω.z, ω.y, zx ω.x + zz ω.z), v = (sin θ, 0, "
+        "cos θ); reflected: (F0 norm + (1 - F0) fresnel) ∫ p L dω",
+        "misplaced_is": "∫ |f (n·l)/norm - p| dω over the sphere, by nodes that the fit has not",
+    }

@@ -1,4 +1,5 @@
 """Tables as files: an array over a grid of parameters, with a manifest beside it that proves it whole."""
+
 from __future__ import annotations
 
 import json
@@ -72,15 +73,38 @@ class Table:
         return self.kind.subject([c["name"] for c in self.recipe["models"].values()], self.recipe.get("scheme"))
 
 
-def lut(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence[int] | None = None,
-        axes: Mapping[str, AxisSpec] | None = None, ndf: Spec | None = None, masking: Spec | None = None,
-        fresnel: Spec | None = None, diffuse: Spec | None = None, brdf: Spec | None = None, light: Spec | None = None,
-        environment: str | os.PathLike[str] | np.ndarray | Environment | None = None,
-        normal: Sequence[float] | None = None, rotate: float = 0.0, exposure: float = 0.0, nonfinite: str = "refuse",
-        backfacing: str | None = None, precision: int = 32, tolerance: float | None = None, fit: str | None = None,
-        as_read: bool = False, scheme: str | None = None, stored: str | None = None, for_: str | None = None,
-        force: bool = False, parameters: Mapping[str, float | str] | None = None, device: Device | str | None = None,
-        dry_run: bool = False, progress: Progress | None = None, **fixed: float) -> Table:
+def lut(
+    kind: str,
+    path: str | os.PathLike[str],
+    *,
+    size: int | str | Sequence[int] | None = None,
+    axes: Mapping[str, AxisSpec] | None = None,
+    ndf: Spec | None = None,
+    masking: Spec | None = None,
+    fresnel: Spec | None = None,
+    diffuse: Spec | None = None,
+    brdf: Spec | None = None,
+    light: Spec | None = None,
+    environment: str | os.PathLike[str] | np.ndarray | Environment | None = None,
+    normal: Sequence[float] | None = None,
+    rotate: float = 0.0,
+    exposure: float = 0.0,
+    nonfinite: str = "refuse",
+    backfacing: str | None = None,
+    precision: int = 32,
+    tolerance: float | None = None,
+    fit: str | None = None,
+    as_read: bool = False,
+    scheme: str | None = None,
+    stored: str | None = None,
+    for_: str | None = None,
+    force: bool = False,
+    parameters: Mapping[str, float | str] | None = None,
+    device: Device | str | None = None,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+    **fixed: float,
+) -> Table:
     """Write a table of an integral of a BRDF to `path`, and its manifest to `path` with .json appended.
 
     kind: what is tabulated, a name that `whitefurnace lut --help` lists: an integral ("dfg", "albedo", …) or a table
@@ -111,15 +135,38 @@ def lut(kind: str, path: str | os.PathLike[str], *, size: int | str | Sequence[i
     Raises UsageError, UnsupportedError, FileError, CheckError, DeviceError, and InputError for a bad environment.
     """
     request = TableRequest(
-        kind, path, size=size, axes=axes, ndf=ndf, masking=masking, fresnel=fresnel, diffuse=diffuse, brdf=brdf,
-        light=light, environment=environment, normal=normal, rotate=rotate, exposure=exposure, nonfinite=nonfinite,
-        backfacing=backfacing, precision=precision, tolerance=tolerance, fit=fit, as_read=as_read, scheme=scheme,
-        stored=stored, for_=for_, force=force, parameters={**(parameters or {}), **fixed})
+        kind,
+        path,
+        size=size,
+        axes=axes,
+        ndf=ndf,
+        masking=masking,
+        fresnel=fresnel,
+        diffuse=diffuse,
+        brdf=brdf,
+        light=light,
+        environment=environment,
+        normal=normal,
+        rotate=rotate,
+        exposure=exposure,
+        nonfinite=nonfinite,
+        backfacing=backfacing,
+        precision=precision,
+        tolerance=tolerance,
+        fit=fit,
+        as_read=as_read,
+        scheme=scheme,
+        stored=stored,
+        for_=for_,
+        force=force,
+        parameters={**(parameters or {}), **fixed},
+    )
     return make(plan(request), device, dry_run=dry_run, progress=progress)
 
 
-def make(request: TablePlan, device: Device | str | None = None, *, dry_run: bool = False,
-         progress: Progress | None = None) -> Table:
+def make(
+    request: TablePlan, device: Device | str | None = None, *, dry_run: bool = False, progress: Progress | None = None
+) -> Table:
     """Make a table as planned, or say what would be done. Raises what `lut` raises."""
     with system_errors(request.path):
         return _make(request, device, dry_run, progress)
@@ -128,8 +175,15 @@ def make(request: TablePlan, device: Device | str | None = None, *, dry_run: boo
 def _make(request: TablePlan, device: Device | str | None, dry_run: bool, progress: Progress | None) -> Table:
     begin = time.perf_counter()
     key, output = request.key(), FileOutput(request.manifest_path)
-    plain = Table(request.kind, request.path, "planned", request.shape, request.axes, request.nbytes,
-                  {"key": key, "recipe": request.canonical()})
+    plain = Table(
+        request.kind,
+        request.path,
+        "planned",
+        request.shape,
+        request.axes,
+        request.nbytes,
+        {"key": key, "recipe": request.canonical()},
+    )
 
     def up_to_date(there: dict[str, Any] | None) -> Table | None:
         if request.force or there is None or there.get("key") != key or not output.is_whole(there):
@@ -156,8 +210,9 @@ def _make(request: TablePlan, device: Device | str | None, dry_run: bool, progre
         lock.release()
 
 
-def _made(request: TablePlan, device: Device | str | None, key: str, plain: Table, begin: float,
-          progress: Progress | None) -> Table:
+def _made(
+    request: TablePlan, device: Device | str | None, key: str, plain: Table, begin: float, progress: Progress | None
+) -> Table:
     """The table, computed and written."""
     on: Any = device if isinstance(device, Device) else choose_device(device) if request.kind.on_device else None
     made: list[Integrated] = []
@@ -193,8 +248,7 @@ def _made(request: TablePlan, device: Device | str | None, key: str, plain: Tabl
         manifest |= {"sha256": digest_file(staged), "bytes": staged.stat().st_size}
         write_manifest(request.manifest_path, manifest, into=transaction)
         transaction.commit()
-    return replace(plain, state="done", manifest=manifest, notices=made[0].notices,
-                   seconds=time.perf_counter() - begin)
+    return replace(plain, state="done", manifest=manifest, notices=made[0].notices, seconds=time.perf_counter() - begin)
 
 
 # ---------------------------------------------------------------------------------------------- reads between texels
@@ -219,8 +273,10 @@ def _fitted(request: TablePlan, run: Run) -> tuple[Integrated, Facts]:
     """Texels whose reads between the axes' ends are most accurate, in `run.out`."""
     out, plain = run.out, replace(run, out=None, progress=None)
     assert out is not None
-    shares = [np.concatenate([[0.0], (np.arange(n) + 0.5) / n, [1.0]])
-              for n in (bilinear.SAMPLES * a.count for a in request.axes)]
+    shares = [
+        np.concatenate([[0.0], (np.arange(n) + 0.5) / n, [1.0]])
+        for n in (bilinear.SAMPLES * a.count for a in request.axes)
+    ]
     truth, down, across, counted, made = _at(request, plain, shares)
     facts = request.kind.facts(request.cells, plain)
     out[...] = bilinear.fit(truth, down, across, counted).reshape(out.shape)
@@ -236,56 +292,101 @@ def _as_read(request: TablePlan, run: Run, out: np.ndarray) -> dict[str, Any]:
     there = np.asarray(request.kind.make(request.cells, run, False)[0].values, np.float64)
     rows = request.axes[1].values()
     at = rows >= bilinear.LEAST if request.axes[1].name == "roughness" else np.ones(rows.size, bool)
-    return {"counted": f"roughness from {bilinear.LEAST}; max_all from the axis's end",
-            "centres": bilinear.errors(np.abs(texels - there.reshape(texels.shape)), at if at.any() else ~at),
-            "between": {name: bilinear.errors(np.abs(bilinear.read(held, down, across) - truth), counted)
-                        for name, held in bilinear.formats(texels, request.dtype).items()}}
+    return {
+        "counted": f"roughness from {bilinear.LEAST}; max_all from the axis's end",
+        "centres": bilinear.errors(np.abs(texels - there.reshape(texels.shape)), at if at.any() else ~at),
+        "between": {
+            name: bilinear.errors(np.abs(bilinear.read(held, down, across) - truth), counted)
+            for name, held in bilinear.formats(texels, request.dtype).items()
+        },
+    }
 
 
 # ---------------------------------------------------------------------------------------------- files
 
 
-def _exr(request: TablePlan, key: str, fill: Callable[[np.ndarray], None], made: list[Integrated],
-         facts: Facts, transaction: Transaction) -> None:
+def _exr(
+    request: TablePlan,
+    key: str,
+    fill: Callable[[np.ndarray], None],
+    made: list[Integrated],
+    facts: Facts,
+    transaction: Transaction,
+) -> None:
     """By way of a file without a name, so that a large table needs little memory."""
     channels = request.shape[2] if len(request.shape) == 3 else 1
     with scratch(request.path, request.shape, request.dtype, fill) as cells:
-        texts = {f"whitefurnace:{name}": value if isinstance(value, str | float) else
-                json.dumps(value, sort_keys=True, ensure_ascii=False)
-                for name, value in {**_manifest(request, key, None, made[0]), **facts}.items()
-                if name not in ("name", "whitefurnace")}
-        write_exr(request.path, cells.reshape(*request.shape[:2], channels), channel_names=CHANNELS[channels],
-                  attributes={"whitefurnace:version": VERSION, **texts}, into=transaction)
+        texts = {
+            f"whitefurnace:{name}": value
+            if isinstance(value, str | float)
+            else json.dumps(value, sort_keys=True, ensure_ascii=False)
+            for name, value in {**_manifest(request, key, None, made[0]), **facts}.items()
+            if name not in ("name", "whitefurnace")
+        }
+        write_exr(
+            request.path,
+            cells.reshape(*request.shape[:2], channels),
+            channel_names=CHANNELS[channels],
+            attributes={"whitefurnace:version": VERSION, **texts},
+            into=transaction,
+        )
 
 
-def _texture(request: TablePlan, key: str, fill: Callable[[np.ndarray], None], made: list[Integrated],
-             facts: Facts, transaction: Transaction) -> None:
+def _texture(
+    request: TablePlan,
+    key: str,
+    fill: Callable[[np.ndarray], None],
+    made: list[Integrated],
+    facts: Facts,
+    transaction: Transaction,
+) -> None:
     """PNG, KTX 2, DDS and C, and what storing costs beside the table's error."""
     cells = np.empty(request.shape, request.dtype)
     fill(cells)
     whole = {**_manifest(request, key, None, made[0]), **facts}
-    texts = {f"whitefurnace:{name}": value if isinstance(value, str) else json.dumps(value, sort_keys=True)
-             for name, value in whole.items() if name not in ("name", "whitefurnace")}
+    texts = {
+        f"whitefurnace:{name}": value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+        for name, value in whole.items()
+        if name not in ("name", "whitefurnace")
+    }
     dimensions = max(len(request.axes), 2)
     letters = ", ".join(["wvuzyx"[-dimensions:][k] for k in range(dimensions)])
     models = [f"{slot} {c.model.name}" for slot, c in request.cells.models.items()]
-    comment = [f"{request.kind.name} of {request.kind.subject(models, request.cells.scheme)}" +
-               f", as [{letters}{', channel' if len(request.shape) > dimensions else ''}]; whitefurnace {VERSION}",
-               *(f"{name}: {along}" for name, along in zip("xyzuvw", request.axes, strict=False)),
-               *(f"{name} = {value:g}" for name, value in request.cells.fixed.items()),
-               *([f"channels: {', '.join(facts['channels'])}"] if "channels" in facts else []),
-               *([facts["formula"]] if "formula" in facts else []),
-               f"error of a value: {made[0].error:.2g}"]
-    stored = write_table(request.path, cells.reshape(*request.shape[:dimensions], -1), request.stored,
-                         slack=made[0].error, texts=texts, comment=comment, into=transaction)
+    comment = [
+        f"{request.kind.name} of {request.kind.subject(models, request.cells.scheme)}"
+        + f", as [{letters}{', channel' if len(request.shape) > dimensions else ''}]; whitefurnace {VERSION}",
+        *(f"{name}: {along}" for name, along in zip("xyzuvw", request.axes, strict=False)),
+        *(f"{name} = {value:g}" for name, value in request.cells.fixed.items()),
+        *([f"channels: {', '.join(facts['channels'])}"] if "channels" in facts else []),
+        *([facts["formula"]] if "formula" in facts else []),
+        f"error of a value: {made[0].error:.2g}",
+    ]
+    stored = write_table(
+        request.path,
+        cells.reshape(*request.shape[:dimensions], -1),
+        request.stored,
+        slack=made[0].error,
+        texts=texts,
+        comment=comment,
+        into=transaction,
+    )
     facts["stored"] = {"format": stored.format, "error": stored.error}
 
 
 def _manifest(request: TablePlan, key: str, device: Device | None, made: Integrated) -> dict[str, Any]:
     recipe = request.canonical()
-    whole = {"whitefurnace": VERSION, "name": request.path.name, "key": key, **recipe, "shape": list(request.shape),
-             "dtype": request.dtype.name, "error": made.error, "rule": made.rule, "evaluations": made.evaluations,
-             "notices": list(made.notices)}
+    whole = {
+        "whitefurnace": VERSION,
+        "name": request.path.name,
+        "key": key,
+        **recipe,
+        "shape": list(request.shape),
+        "dtype": request.dtype.name,
+        "error": made.error,
+        "rule": made.rule,
+        "evaluations": made.evaluations,
+        "notices": list(made.notices),
+    }
     return whole if device is None else {**whole, "device": device.identity()}
 
 

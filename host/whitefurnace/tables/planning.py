@@ -1,4 +1,5 @@
 """A request for a table, checked and completed: what will be computed and written, found without a device."""
+
 from __future__ import annotations
 
 import hashlib
@@ -90,13 +91,22 @@ class TablePlan:
     def canonical(self) -> dict[str, Any]:
         """The recipe as data: everything that changes the bytes, and nothing else."""
         cells = self.cells
-        return {"integral": self.kind.name, "models": {slot: c.canonical() for slot, c in self.spec.slots.items()},
-                "parameters": dict(cells.fixed), "axes": [a.canonical() for a in self.axes],
-                "backfacing": cells.backfacing, "precision": self.precision, "tolerance": self.tolerance,
-                **({"fit": self.fit} if self.fit else {}), **({"as_read_stated": True} if self.as_read else {}),
-                **({"scheme": cells.scheme} if cells.scheme else {}), **cells.lighting.recipe,
-                **({"stored_format": self.stored} if self.stored else {}), **self.kind.recipe(),
-                "format": self.form}
+        return {
+            "integral": self.kind.name,
+            "models": {slot: c.canonical() for slot, c in self.spec.slots.items()},
+            "parameters": dict(cells.fixed),
+            "axes": [a.canonical() for a in self.axes],
+            "backfacing": cells.backfacing,
+            "precision": self.precision,
+            "tolerance": self.tolerance,
+            **({"fit": self.fit} if self.fit else {}),
+            **({"as_read_stated": True} if self.as_read else {}),
+            **({"scheme": cells.scheme} if cells.scheme else {}),
+            **cells.lighting.recipe,
+            **({"stored_format": self.stored} if self.stored else {}),
+            **self.kind.recipe(),
+            "format": self.form,
+        }
 
     def key(self) -> str:
         """sha256 over the recipe, the kernels and the version."""
@@ -132,8 +142,10 @@ def _check_file(kind: Kind, path: Path, precision: int) -> None:
     """Raises UsageError for a file that cannot hold such a table."""
     form = path.suffix.lower()
     if form not in FORMS:
-        raise UsageError(f"{path}: a table is written as {', '.join(FORMS[:-1])} or {FORMS[-1]}, not "
-                         f"{path.suffix or 'without a suffix'}")
+        raise UsageError(
+            f"{path}: a table is written as {', '.join(FORMS[:-1])} or {FORMS[-1]}, not "
+            f"{path.suffix or 'without a suffix'}"
+        )
     if precision not in DEFAULT_TOLERANCE:
         raise UsageError(f"precision {precision} is not one of {', '.join(map(str, DEFAULT_TOLERANCE))}")
     if form not in (".npy", ".h") and precision == 64:
@@ -164,20 +176,23 @@ def _check_axes(kind: Kind, path: Path, axes: tuple[Axis, ...], request: TableRe
         raise UsageError(f"unknown fit {request.fit!r}{nearest(str(request.fit), FITS)}")
     as_read = request.as_read or request.fit is not None
     if as_read and not kind.refittable:
-        raise UsageError(f"{kind.name} is a fit by itself, and states what is misplaced between texels: leave out "
-                         "--fit and --as-read")
+        raise UsageError(
+            f"{kind.name} is a fit by itself, and states what is misplaced between texels: leave out "
+            "--fit and --as-read"
+        )
     if as_read and not (len(axes) == 2 and all(FITTED[0] <= a.count <= FITTED[1] for a in axes)):
         raise UsageError(f"what is read between texels is told of tables with two axes of {FITTED[0]} to {FITTED[1]}")
     return as_read
 
 
-def _check_shape(kind: Kind, path: Path, axes: tuple[Axis, ...], shape: tuple[int, ...],
-                 stored: str | None) -> str | None:
+def _check_shape(
+    kind: Kind, path: Path, axes: tuple[Axis, ...], shape: tuple[int, ...], stored: str | None
+) -> str | None:
     """The pixel format of a texture, None for other files. Raises UsageError for an array that the file cannot hold."""
     form = path.suffix.lower()
     if form == ".exr" and shape[2:] and shape[2] not in CHANNELS:
         raise UsageError(f"EXR holds 1 to 4 channels, not {shape[2]}: give .npy{kind.if_too_many_channels}")
-    rows, channels = shape[:max(len(axes), 2)], math.prod(shape[max(len(axes), 2):])
+    rows, channels = shape[: max(len(axes), 2)], math.prod(shape[max(len(axes), 2) :])
     if form not in (".npy", ".exr") and not kind.coefficients:
         check_table(form, rows, channels)
     return stored_format(form, channels, stored)

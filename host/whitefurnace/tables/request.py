@@ -1,4 +1,5 @@
 """What a caller asks of a table, before anything of it is checked."""
+
 from __future__ import annotations
 
 import os

@@ -1,4 +1,5 @@
 """The split-sum pair in the forms and with the channels that engines read."""
+
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
@@ -42,8 +43,12 @@ class SplitSum:
     notices: tuple[str, ...]
 
 
-def laid_out(form: str, pair: Mapping[str, Any], cloth: Mapping[str, Any] | None = None,
-             progress: Callable[[float], None] | None = None) -> tuple[Integrated, float]:
+def laid_out(
+    form: str,
+    pair: Mapping[str, Any],
+    cloth: Mapping[str, Any] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> tuple[Integrated, float]:
     """Compute the pair in a form, […, 2], or with Charlie's albedo as a third channel, and the error of that channel.
 
     form: a key of `CHANNELS`. pair: arguments of `integrate` for the pair. cloth: those for Charlie's albedo, or None
@@ -61,8 +66,12 @@ def laid_out(form: str, pair: Mapping[str, Any], cloth: Mapping[str, Any] | None
     values = np.concatenate([made.values, np.broadcast_to(own.values, made.values.shape[:-1])[..., None]], -1)
     if out is not None:
         out[...] = values
-    return replace(made, values=values if out is None else out, evaluations=made.evaluations + own.evaluations,
-                   notices=(*made.notices, *own.notices)), float(own.error)
+    return replace(
+        made,
+        values=values if out is None else out,
+        evaluations=made.evaluations + own.evaluations,
+        notices=(*made.notices, *own.notices),
+    ), float(own.error)
 
 
 def charlie(cells: Cells) -> dict[str, Any]:
@@ -81,14 +90,22 @@ def axis_values(name: str, spacing: str, size: int) -> np.ndarray:
 def split_sum(table: Dfg, *, device: Device, ndf: Spec = "ggx", masking: Spec = "smith") -> SplitSum:
     """Compute the split-sum table of an engine, in float32. Raises as `integrate` does."""
     x, y = (axis_values(name, table.NoV, table.size) for name in (table.x, table.y))
-    across = {table.x: np.broadcast_to(x[None], (table.size, table.size)),
-              table.y: np.broadcast_to(y[:, None], (table.size, table.size))}
+    across = {
+        table.x: np.broadcast_to(x[None], (table.size, table.size)),
+        table.y: np.broadcast_to(y[:, None], (table.size, table.size)),
+    }
     roughness = across["roughness"] if "roughness" in across else np.sqrt(across["alpha"])
 
     def of(spec: Spec) -> dict[str, Any]:
         choice = chosen("ndf", spec)
-        return {"ndf": choice, "masking": masking, "tolerance": TOLERANCE, "device": device, "NoV": across["NoV"],
-                **rows_of_roughness(choice, roughness)}
+        return {
+            "ndf": choice,
+            "masking": masking,
+            "tolerance": TOLERANCE,
+            "device": device,
+            "NoV": across["NoV"],
+            **rows_of_roughness(choice, roughness),
+        }
 
     made, charlie_error = laid_out(table.form, of(ndf), of("charlie") if table.charlie else None)
     return SplitSum(made.values, made.error, charlie_error, made.rule, made.notices)

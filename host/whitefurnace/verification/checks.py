@@ -1,4 +1,5 @@
 """Checks of models, derived from what their catalogue entries state: one row a check, with its worst cell."""
+
 from __future__ import annotations
 
 import math
@@ -50,8 +51,9 @@ FAMILY = 1e-4
 # n·v from grazing to normal, the ends thicker.
 NOV = np.array([0.0, 1e-4, 1e-3, 1 / 64, 0.1, 0.3, 0.6, 0.9, 0.999, 1.0])
 # Angles with both ends thicker, without those where sine or cosine is 0.
-ANGLES = np.concatenate([np.geomspace(1e-6, 0.1, 26), np.linspace(0.15, 1.4, 12),
-                         math.pi / 2 - np.geomspace(0.1, 1e-6, 16)])
+ANGLES = np.concatenate(
+    [np.geomspace(1e-6, 0.1, 26), np.linspace(0.15, 1.4, 12), math.pi / 2 - np.geomspace(0.1, 1e-6, 16)]
+)
 PHI = np.array([0.0, 0.4, math.pi / 2, 2.5])
 
 Columns = dict[str, np.ndarray]
@@ -139,13 +141,16 @@ def _of_file(slot: str, path: str, spec: str) -> Subject:
     choice = chosen(slot, spec)
     missing = [p.name for p in choice.model.parameters if p.name not in choice.given]
     if missing:
-        raise UsageError(f"{slot} {path}: {', '.join(missing)} must be given, as {Path(path).name}:"
-                         + ",".join(f"{name}=VALUE" for name in missing))
+        raise UsageError(
+            f"{slot} {path}: {', '.join(missing)} must be given, as {Path(path).name}:"
+            + ",".join(f"{name}=VALUE" for name in missing)
+        )
     return Subject(choice.model, str(Path(path)), choice.given)
 
 
-def verify(asked: Sequence[Subject], precisions: Iterable[int], device: Device,
-           progress: Progress | None = None) -> Iterator[Row]:
+def verify(
+    asked: Sequence[Subject], precisions: Iterable[int], device: Device, progress: Progress | None = None
+) -> Iterator[Row]:
     """Run all checks of every subject in each precision, one after the other, and yield their rows.
 
     Raises UnsupportedError for float64 on a device without it, and what a user's file is refused for.
@@ -167,8 +172,7 @@ def verify(asked: Sequence[Subject], precisions: Iterable[int], device: Device,
 
 
 def _between(p: Parameter) -> np.ndarray:
-    """Typical values, the ends of the domain and what lies between: at the geometric mean where values are far apart.
-    """
+    """Typical values, the ends of the domain and what lies between: at the geometric mean where values are far apart."""
     known = sorted({*p.typical, p.low, p.high})
     middles = [math.sqrt(a * b) if a > 0 and b > 2 * a else (a + b) / 2 for a, b in pairwise(known)]
     return np.array(sorted({*known, *middles}))
@@ -231,8 +235,9 @@ class Bench:
         """Return values as the kernel reads them, in float64."""
         return np.asarray(values, f"f{self.precision // 8}").astype(np.float64)
 
-    def kernel(self, function: str, arguments: Sequence[np.ndarray], columns: Columns,
-               under: Mapping[str, Model] | None = None) -> np.ndarray:
+    def kernel(
+        self, function: str, arguments: Sequence[np.ndarray], columns: Columns, under: Mapping[str, Model] | None = None
+    ) -> np.ndarray:
         """Evaluate a model function on the device: (components, n) float64.
 
         arguments: the function's own. columns: the parameters by name. under: models of other slots that its text
@@ -259,25 +264,40 @@ class Bench:
         slots: dict[str, Any] = {self.model.slot: self.model}
         try:
             with np.errstate(invalid="ignore", over="ignore"):
-                done = integrate(name, precision=self.precision, tolerance=tolerance, device=self.device,
-                                 **slots, **asked)
+                done = integrate(
+                    name, precision=self.precision, tolerance=tolerance, device=self.device, **slots, **asked
+                )
         except CheckError as error:
             numbers = [np.shape(v) for v in asked.values() if not isinstance(v, (str, Model))]
             return np.full(np.broadcast_shapes(*numbers), np.nan), 0.0, str(error)
         return np.asarray(done.values, np.float64), done.error, "; ".join(done.notices)
 
-    def row(self, check: str, value: Any, expected: Any, tolerance: Any, where: Mapping[str, Any], *,
-            bound: str = "", note: str = "") -> Row:
+    def row(
+        self,
+        check: str,
+        value: Any,
+        expected: Any,
+        tolerance: Any,
+        where: Mapping[str, Any],
+        *,
+        bound: str = "",
+        note: str = "",
+    ) -> Row:
         """Return the row of the worst of all cells of `value` against `expected`.
 
         where: the parameters and directions of the cells by name. bound: "most" or "least" where `expected` is a bound,
         empty where it is the exact value.
         """
         names = list(where)
-        shape = np.broadcast_shapes(np.shape(value), np.shape(expected), np.shape(tolerance),
-                                    *(np.shape(where[n]) if n not in "lv" else np.shape(where[n])[:-1] for n in names))
-        value, expected, tolerance = (np.broadcast_to(np.asarray(a, np.float64), shape).ravel()
-                                      for a in (value, expected, tolerance))
+        shape = np.broadcast_shapes(
+            np.shape(value),
+            np.shape(expected),
+            np.shape(tolerance),
+            *(np.shape(where[n]) if n not in "lv" else np.shape(where[n])[:-1] for n in names),
+        )
+        value, expected, tolerance = (
+            np.broadcast_to(np.asarray(a, np.float64), shape).ravel() for a in (value, expected, tolerance)
+        )
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             error = value - expected if bound == "most" else expected - value if bound else np.abs(value - expected)
             error = np.where(value == expected, 0.0, error)  # infinities alike
@@ -294,10 +314,21 @@ class Bench:
                 own[name] = [float(x) for x in vector]
             else:
                 own[name] = float(np.broadcast_to(where[name], shape).ravel()[k])
-        return Row(self.model.slot, self.subject.label, check, {n: v for n, v in own.items() if n not in "lv"},
-                   self.precision, float(value[k]), float(expected[k]),
-                   max(float(error[k]), 0.0) if bound else float(error[k]), float(tolerance[k]), passed, value.size,
-                   note, None if passed else own)
+        return Row(
+            self.model.slot,
+            self.subject.label,
+            check,
+            {n: v for n, v in own.items() if n not in "lv"},
+            self.precision,
+            float(value[k]),
+            float(expected[k]),
+            max(float(error[k]), 0.0) if bound else float(error[k]),
+            float(tolerance[k]),
+            passed,
+            value.size,
+            note,
+            None if passed else own,
+        )
 
     def measured(self, check: str, value: Any, where: Mapping[str, Any], least: bool = False, note: str = "") -> Row:
         """Return the row of a value that is stated and not judged: the largest of all cells, or the least.
@@ -308,8 +339,21 @@ class Bench:
         known = not np.isnan(flat).all()
         k = int(np.nanargmin(flat) if least else np.nanargmax(flat)) if known else 0
         own = {n: float(np.broadcast_to(c, np.shape(value)).ravel()[k]) for n, c in where.items()}
-        return Row(self.model.slot, self.subject.label, check, own, self.precision, float(flat[k]), None, None, None,
-                   known, flat.size, note, None if known else own)
+        return Row(
+            self.model.slot,
+            self.subject.label,
+            check,
+            own,
+            self.precision,
+            float(flat[k]),
+            None,
+            None,
+            None,
+            known,
+            flat.size,
+            note,
+            None if known else own,
+        )
 
 
 def _product(*axes: Any, columns: Columns) -> tuple[list[np.ndarray], Columns]:
@@ -319,8 +363,9 @@ def _product(*axes: Any, columns: Columns) -> tuple[list[np.ndarray], Columns]:
     return mesh[:-1], {name: c[mesh[-1]] for name, c in columns.items()}
 
 
-def _conditioned(reference: Callable[..., np.ndarray], arguments: Sequence[np.ndarray], columns: Columns,
-                 steps: Sequence[Any]) -> tuple[np.ndarray, np.ndarray]:
+def _conditioned(
+    reference: Callable[..., np.ndarray], arguments: Sequence[np.ndarray], columns: Columns, steps: Sequence[Any]
+) -> tuple[np.ndarray, np.ndarray]:
     """A reference, and by how much it changes when its arguments do by `steps` and its parameters by the last of them:
     no kernel that computes in rounded numbers can do better."""
     with np.errstate(all="ignore"):
@@ -382,8 +427,14 @@ def _weak_furnace(b: Bench) -> Iterator[Row]:
     masking = _smith()[0]
     values, _, note = b.integral("weak_furnace", RULE[b.precision], masking=masking, **views, **columns)
     where = {**views, **columns, "v": _direction(views["NoV"], views.get("phi", 0.0))}
-    yield b.row(f"weak furnace, {masking.name}", values, masking.checks.weak_furnace,
-                b.tolerance("weak furnace", INTEGRAL), where, note=note)
+    yield b.row(
+        f"weak furnace, {masking.name}",
+        values,
+        masking.checks.weak_furnace,
+        b.tolerance("weak furnace", INTEGRAL),
+        where,
+        note=note,
+    )
 
 
 def _energy(b: Bench) -> Iterator[Row]:
@@ -395,8 +446,15 @@ def _energy(b: Bench) -> Iterator[Row]:
     if b.model.text is not None:
         yield b.measured("least albedo", values, where, least=True)
         yield b.measured("largest albedo", values, where)
-    yield b.row("energy: albedo, F = 1", values, 1.0, 2 * ENERGY,
-                {**where, "v": _direction(views["NoV"], views.get("phi", 0.0))}, bound="most", note=note)
+    yield b.row(
+        "energy: albedo, F = 1",
+        values,
+        1.0,
+        2 * ENERGY,
+        {**where, "v": _direction(views["NoV"], views.get("phi", 0.0))},
+        bound="most",
+        note=note,
+    )
 
 
 def _normals(b: Bench, columns: Columns) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], Columns]:
@@ -447,8 +505,13 @@ def _kernel_area(b: Bench) -> Iterator[Row]:
     steps = [np.maximum(b.rounding * np.minimum(a, np.abs(math.pi / 2 - a)), 2**-52 * np.abs(a)) for a in angles]
     want, unsure = _conditioned(b.model.reference["area"], angles, own, [*steps, b.rounding])
     got = b.kernel("NDF_AREA", arguments, own)[0]
-    yield b.row("kernel area", got, want, RELATIVE[b.precision] * want + 8 * unsure,
-                {**dict(zip(("theta_v", "phi_v"), angles, strict=False)), **own})
+    yield b.row(
+        "kernel area",
+        got,
+        want,
+        RELATIVE[b.precision] * want + 8 * unsure,
+        {**dict(zip(("theta_v", "phi_v"), angles, strict=False)), **own},
+    )
 
 
 DRAWS = 1 << 19
@@ -493,9 +556,14 @@ def _chi2(b: Bench) -> Iterator[Row]:
     found, freedom, critical = np.empty(sets), np.empty(sets), np.empty(sets)
     for k in range(sets):
         own = {n: float(c[k]) for n, c in columns.items()}
-        stretch = [1.0, 1.0] if b.model.isotropic else [
-            float(b.kernel(f"NDF_STRETCH_{axis}", [], {n: np.array([v]) for n, v in own.items()})[0, 0])
-            for axis in "XY"]
+        stretch = (
+            [1.0, 1.0]
+            if b.model.isotropic
+            else [
+                float(b.kernel(f"NDF_STRETCH_{axis}", [], {n: np.array([v]) for n, v in own.items()})[0, 0])
+                for axis in "XY"
+            ]
+        )
         m = sample(b.model, DRAWS, seed=crc32(b.model.name.encode()) + k, device=b.device, precision=b.precision, **own)
         edges, share = _slope_energy(b, own, stretch)
         sx, sy = m[:, 0] / stretch[0], m[:, 1] / stretch[1]
@@ -511,8 +579,15 @@ def _chi2(b: Bench) -> Iterator[Row]:
         # [WilsonHilferty1931]: the cube root of χ²/k is nearly normal; the level is met to a few percent.
         spread = 2 / (9 * freedom[k])
         critical[k] = freedom[k] * (1 - spread + level * math.sqrt(spread)) ** 3
-    yield b.row("sampler, chi²", found, freedom, critical - freedom, columns, bound="most",
-                note=f"{DRAWS} normals a set, expected is the degrees of freedom")
+    yield b.row(
+        "sampler, chi²",
+        found,
+        freedom,
+        critical - freedom,
+        columns,
+        bound="most",
+        note=f"{DRAWS} normals a set, expected is the degrees of freedom",
+    )
 
 
 def _samplers() -> int:
@@ -527,8 +602,9 @@ def _geometry(b: Bench) -> tuple[Columns, np.ndarray, np.ndarray]:
     """Arguments of V and G for pairs of directions, areas of many roughnesses with them, as the kernel reads them."""
     cosines = np.array([0.0, 1e-4, 1e-3, 1 / 64, 0.1, 0.4, 0.8, 1.0])
     spread = np.array([1e-4, 0.1, 0.5, 1.0])
-    (NoV, NoL, phi, alpha), own = _product(cosines, cosines[1:], np.array([0.0, 1.0, 2.0, math.pi]), spread,
-                                           columns=b.columns())
+    (NoV, NoL, phi, alpha), own = _product(
+        cosines, cosines[1:], np.array([0.0, 1.0, 2.0, math.pi]), spread, columns=b.columns()
+    )
     NoV, NoL = b.rounded(NoV), b.rounded(NoL)
     v, light = _direction(NoV), _direction(NoL, phi)
     VoH = np.linalg.norm(v + light, axis=-1) / 2
@@ -546,8 +622,11 @@ def _geometry(b: Bench) -> tuple[Columns, np.ndarray, np.ndarray]:
 
 def _any_ndf(b: Bench) -> dict[str, Model]:
     """An NDF for the text of a masking that wants one."""
-    return {"ndf": next(m for m in models("ndf").values() if m.isotropic and "NDF_AREA" in m.provides)} \
-        if b.model.needs else {}
+    return (
+        {"ndf": next(m for m in models("ndf").values() if m.isotropic and "NDF_AREA" in m.provides)}
+        if b.model.needs
+        else {}
+    )
 
 
 ARGUMENTS = ("NoV", "NoL", "NoH", "VoH", "at_v", "at_l")
@@ -579,22 +658,30 @@ def _kernel_masking(b: Bench) -> Iterator[Row]:
     swapped = [cells[n] for n in ("NoL", "NoV", "NoH", "VoH", "at_l", "at_v")]
     other = b.kernel("MASKING_V", swapped, own, under)[0]
     one, other = V[faces], other[faces]
-    yield _reciprocity(b, one, other, 16 * b.rounding * np.maximum(np.abs(one), np.abs(other)),
-                       {n: c[faces] for n, c in where.items()}, scale=np.maximum(np.abs(one), 1e-30))
+    yield _reciprocity(
+        b,
+        one,
+        other,
+        16 * b.rounding * np.maximum(np.abs(one), np.abs(other)),
+        {n: c[faces] for n, c in where.items()},
+        scale=np.maximum(np.abs(one), 1e-30),
+    )
     behind = [arguments[0], -cells["NoL"], *arguments[2:]]
     yield b.row("G of a backfacing light", b.kernel("MASKING_G", behind, own, under)[0], 0.0, 0.0, where)
 
 
-def _reciprocity(b: Bench, one: np.ndarray, other: np.ndarray, tolerance: Any, where: Mapping[str, Any],
-                 scale: Any) -> Row:
+def _reciprocity(
+    b: Bench, one: np.ndarray, other: np.ndarray, tolerance: Any, where: Mapping[str, Any], scale: Any
+) -> Row:
     """Equal under exchange of l and v where the entry says so; where it denies it, a difference must be seen."""
     if b.model.checks.reciprocal is not False:
         return b.row("reciprocity", one, other, tolerance, where)
     apart = np.abs(one - other) / scale
     k = int(np.nanargmax(apart))
     worst = {n: np.asarray(c)[k] for n, c in where.items()}
-    return b.row("not reciprocal, as declared", apart[k], 1e-3, 0.0, worst, bound="least",
-                 note="largest relative difference")
+    return b.row(
+        "not reciprocal, as declared", apart[k], 1e-3, 0.0, worst, bound="least", note="largest relative difference"
+    )
 
 
 def _furnace_of_masking(b: Bench) -> Iterator[Row]:
@@ -618,11 +705,22 @@ def _furnace_of_masking(b: Bench) -> Iterator[Row]:
         values, _, note = facets.integral("weak_furnace", RULE[b.precision], masking=b.model, **views, **sent)
         where = {**views, **columns}
         if declared is not None:
-            yield b.row(f"weak furnace with {ndf.name}", values, declared, facets.tolerance("weak furnace", INTEGRAL),
-                        {**where, "v": _direction(views["NoV"], views.get("phi", 0.0))}, note=note)
+            yield b.row(
+                f"weak furnace with {ndf.name}",
+                values,
+                declared,
+                facets.tolerance("weak furnace", INTEGRAL),
+                {**where, "v": _direction(views["NoV"], views.get("phi", 0.0))},
+                note=note,
+            )
         else:
-            yield b.measured(f"weak furnace with {ndf.name}", values, where, least=True,
-                             note="not declared; the least, 1 would be right")
+            yield b.measured(
+                f"weak furnace with {ndf.name}",
+                values,
+                where,
+                least=True,
+                note="not declared; the least, 1 would be right",
+            )
 
 
 # ---------------------------------------------------------------------------------------------- fresnel
@@ -656,8 +754,13 @@ def _limits(b: Bench) -> Iterator[Row]:
             continue
         at, kept = b.rounded(at[use]), {n: c[use] for n, c in own.items()}
         _, unsure = _conditioned(b.model.reference["F"], [at], kept, [2 * b.rounding * at, b.rounding])
-        yield b.row(f"F at {name}", b.kernel("FRESNEL_F", [at], kept)[0], value[use],
-                    2 * RELATIVE[b.precision] + 2 * unsure, {"cos_d": at, **kept})
+        yield b.row(
+            f"F at {name}",
+            b.kernel("FRESNEL_F", [at], kept)[0],
+            value[use],
+            2 * RELATIVE[b.precision] + 2 * unsure,
+            {"cos_d": at, **kept},
+        )
 
 
 # ---------------------------------------------------------------------------------------------- diffuse
@@ -666,8 +769,9 @@ def _limits(b: Bench) -> Iterator[Row]:
 def _pairs(b: Bench, columns: Columns) -> tuple[np.ndarray, np.ndarray, Columns]:
     """Directions (n, 3) of light and view, grazing ones among them, times parameter sets."""
     cosines = np.array([1e-4, 1e-2, 0.15, 0.5, 0.9, 1.0])
-    (NoL, NoV, phi, around), own = _product(cosines, cosines, np.array([0.0, 0.7, math.pi / 2, 2.2, math.pi]),
-                                            np.array([0.0, 1.3]), columns=columns)
+    (NoL, NoV, phi, around), own = _product(
+        cosines, cosines, np.array([0.0, 0.7, math.pi / 2, 2.2, math.pi]), np.array([0.0, 1.3]), columns=columns
+    )
     return b.rounded(_direction(NoL, phi + around)), b.rounded(_direction(NoV, around)), own
 
 
@@ -684,8 +788,14 @@ def _kernel_f(b: Bench) -> Iterator[Row]:
     relative = b.tolerance("kernel f", RELATIVE)
     yield b.row("kernel f", got, want, relative * (np.abs(want) + 1 / math.pi) + 4 * unsure, where)
     swapped = b.kernel("DIFFUSE_F", [*v.T, *light.T], own)[0]
-    yield _reciprocity(b, got, swapped, RELATIVE[b.precision] * (np.abs(got) + 1 / math.pi) + 4 * unsure, where,
-                       scale=np.maximum(np.abs(got), 1e-30))
+    yield _reciprocity(
+        b,
+        got,
+        swapped,
+        RELATIVE[b.precision] * (np.abs(got) + 1 / math.pi) + 4 * unsure,
+        where,
+        scale=np.maximum(np.abs(got), 1e-30),
+    )
     if b.model.checks.negative:
         yield b.measured("least f", got, own, least=True, note="declared")
     else:
@@ -704,8 +814,14 @@ def _albedo(b: Bench) -> Iterator[Row]:
             finite = np.isfinite(b.model.reference["albedo"](NoV, **columns))
         # Where it is infinite at grazing it must be said to be.
         infinite = ~finite & np.isinf(values)
-        yield b.row("albedo", np.where(infinite, 0.0, values), np.where(infinite, 0.0, want),
-                    b.tolerance("albedo", INTEGRAL) * np.where(infinite, 1.0, size), where, note=note)
+        yield b.row(
+            "albedo",
+            np.where(infinite, 0.0, values),
+            np.where(infinite, 0.0, want),
+            b.tolerance("albedo", INTEGRAL) * np.where(infinite, 1.0, size),
+            where,
+            note=note,
+        )
     largest = math.inf if b.model.checks.largest_albedo is None else b.model.checks.largest_albedo
     if largest <= 1:
         yield b.row("energy: albedo", values, 1.0, INTEGRAL[b.precision], where, bound="most", note=note)
@@ -713,9 +829,12 @@ def _albedo(b: Bench) -> Iterator[Row]:
         # A declared figure is rounded to its fourth decimal.
         yield b.row("energy: albedo as declared", values, largest, 6e-5, where, bound="most", note=note)
     else:
-        yield b.measured("largest albedo", values[NOV > 0], {n: np.broadcast_to(c, values.shape)[NOV > 0]
-                                                             for n, c in where.items() if n != "v"},
-                         note="declared without bound")
+        yield b.measured(
+            "largest albedo",
+            values[NOV > 0],
+            {n: np.broadcast_to(c, values.shape)[NOV > 0] for n, c in where.items() if n != "v"},
+            note="declared without bound",
+        )
 
 
 # ---------------------------------------------------------------------------------------------- a user's BRDF
@@ -764,11 +883,20 @@ def _user_brdf_at(b: Bench, light: np.ndarray, v: np.ndarray, own: Columns) -> I
         yield b.measured("largest albedo", values, {**views, **own})
     k = np.unravel_index(np.nanargmax(values) if np.isfinite(values).any() else 0, values.shape)
     towards = _direction(views["NoV"][k], views["phi"][k])
-    most = (f * light[:, 2]).max(0) if np.isnan(values).any() else (
-        b.kernel("BRDF_F", [*light.T, *np.repeat(towards[:, None], len(light), 1)], own) * light[:, 2]).max(0)
-    yield b.row("energy: albedo", values, 1.0, 1e-5 + stated,
-                {**views, **own, "l": light[int(np.nanargmax(most))], "v": _direction(views["NoV"], views["phi"])},
-                bound="most", note=note or "l: where most light comes from")
+    most = (
+        (f * light[:, 2]).max(0)
+        if np.isnan(values).any()
+        else (b.kernel("BRDF_F", [*light.T, *np.repeat(towards[:, None], len(light), 1)], own) * light[:, 2]).max(0)
+    )
+    yield b.row(
+        "energy: albedo",
+        values,
+        1.0,
+        1e-5 + stated,
+        {**views, **own, "l": light[int(np.nanargmax(most))], "v": _direction(views["NoV"], views["phi"])},
+        bound="most",
+        note=note or "l: where most light comes from",
+    )
 
 
 # ---------------------------------------------------------------------------------------------- light
@@ -799,8 +927,11 @@ of their halves at random, 1e-5 together."""
 
 def _irradiance(b: Bench, own: Mapping[str, float]) -> float:
     """∫ L (n·l) dω/π of the light's float64 reference, by the midpoints of cells of equal projected solid angle."""
-    sin2, phi = np.meshgrid((np.arange(HEMISPHERE[0]) + 0.5) / HEMISPHERE[0],
-                            (np.arange(HEMISPHERE[1]) + 0.5) * (2 * math.pi / HEMISPHERE[1]), indexing="ij")
+    sin2, phi = np.meshgrid(
+        (np.arange(HEMISPHERE[0]) + 0.5) / HEMISPHERE[0],
+        (np.arange(HEMISPHERE[1]) + 0.5) * (2 * math.pi / HEMISPHERE[1]),
+        indexing="ij",
+    )
     return float(np.mean(b.model.reference["L"](_direction(np.sqrt(1 - sin2), phi).reshape(-1, 3), **own)))
 
 
@@ -815,8 +946,14 @@ def _lit(b: Bench) -> Iterator[Row]:
     got = radiance(light=b.model, diffuse="lambert:albedo=1", NoV=0.6, precision=b.precision, device=b.device, **sent)
     scale = np.abs(columns.get("color", columns.get("radiance", np.ones(len(sets)))))
     usual = 8 * b.rounding if punctual else 1e-4
-    yield b.row("white Lambertian", got.values, want, usual * scale, columns,
-                note="c (n·l)" if punctual else "irradiance/π of the reference")
+    yield b.row(
+        "white Lambertian",
+        got.values,
+        want,
+        usual * scale,
+        columns,
+        note="c (n·l)" if punctual else "irradiance/π of the reference",
+    )
     if punctual:
         return
     around = _direction(np.linspace(-1, 1, 9)[:, None], np.linspace(0, 6, 9)).reshape(-1, 3)

@@ -2,6 +2,7 @@
 
 Every value comes from the device, as users get it, and is compared with the float64 reference of the catalogue.
 """
+
 from __future__ import annotations
 
 import math
@@ -100,8 +101,11 @@ class _Sheet:
     def families(self) -> list[_Family]:
         """Return a family for each parameter that is worth varying; one without a name where there is none."""
         usual = self.usual()
-        found = [_Family(p, self.values[p.name], {k: v for k, v in usual.items() if k != p.name})
-                 for p in self.entry.parameters if len(self.values[p.name]) > 1]
+        found = [
+            _Family(p, self.values[p.name], {k: v for k, v in usual.items() if k != p.name})
+            for p in self.entry.parameters
+            if len(self.values[p.name]) > 1
+        ]
         return found or [_Family(None, (0.0,), usual)]
 
 
@@ -169,17 +173,23 @@ def _free(path: Path, taken: Iterable[Path]) -> Path:
     return free
 
 
-def _evaluate(device: Device, function: str, slots: Mapping[str, Model], own: Sequence[Any],
-              numbers: Mapping[str, Numbers], precision: int = 32) -> np.ndarray:
+def _evaluate(
+    device: Device,
+    function: str,
+    slots: Mapping[str, Model],
+    own: Sequence[Any],
+    numbers: Mapping[str, Numbers],
+    precision: int = 32,
+) -> np.ndarray:
     """A model function at its own arguments and the parameters of each slot, all broadcast, as float64; RGB first."""
     columns = [*own, *(numbers[slot][p.name] for slot, m in slots.items() for p in m.parameters)]
     arrays = np.broadcast_arrays(*(np.asarray(c, np.float64) for c in columns))
     shape = arrays[0].shape
     flat = np.array([a.ravel() for a in arrays])
-    read, terms, cells = len(own), 0, [flat[:len(own)]]
+    read, terms, cells = len(own), 0, [flat[: len(own)]]
     for slot, entry in slots.items():
         count = len(entry.parameters)
-        cells.append(numbers_of(device, entry, flat[read:read + count]))
+        cells.append(numbers_of(device, entry, flat[read : read + count]))
         read += count
         if slot == "ndf" and "NDF_AREA" not in entry.provides and len(slots) > 1:
             table = Areas(device, entry, precision).table(cells[-1])
@@ -209,6 +219,7 @@ def _axis(parameter: Parameter, values: Sequence[float], count: int) -> tuple[np
         return np.geomspace(least, high, count), True
     return np.linspace(low, high, count), False
 
+
 COSINES = np.sin(np.linspace(0.02, math.pi / 2, 97)) ** 2
 """n·v of the curves: more of them at both ends."""
 
@@ -222,11 +233,16 @@ def _symbol(parameter: Parameter) -> str:
 def _heading(sheet: _Sheet, rows: Sequence[Row]) -> None:
     figure, entry = sheet.figure, sheet.entry
     failed = sorted({row.check for row in rows if not row.passed})
-    said = [SLOT_TITLES[entry.slot], f"[{entry.citation.key}]" if entry.citation.key else "",
-            f"float32 on {sheet.device.identity()['name']}"]
+    said = [
+        SLOT_TITLES[entry.slot],
+        f"[{entry.citation.key}]" if entry.citation.key else "",
+        f"float32 on {sheet.device.identity()['name']}",
+    ]
     if rows:
-        said.append(f"{sum(row.passed for row in rows)} of {len(rows)} checks passed"
-                    + (f", failed: {', '.join(failed[:2])}{' …' if len(failed) > 2 else ''}" if failed else ""))
+        said.append(
+            f"{sum(row.passed for row in rows)} of {len(rows)} checks passed"
+            + (f", failed: {', '.join(failed[:2])}{' …' if len(failed) > 2 else ''}" if failed else "")
+        )
     title = entry.title if entry.text is None else f"{entry.name}, {entry.title}"
     heading(figure, title, "  ·  ".join(filter(None, said)), RED if failed else "0.35")
 
@@ -248,8 +264,15 @@ def _map(figure: Figure, axes: Axes, x: np.ndarray, y: np.ndarray, error: np.nda
     colours = colours.with_extremes(under=colours(0.0))
     axes.set_facecolor("0.85")
     axes.grid(False)
-    mesh = axes.pcolormesh(x, y, np.ma.masked_invalid(np.maximum(error, 1e-300)), cmap=colours, shading="nearest",
-                           norm=logarithmic_scale(FINEST, COARSEST), rasterized=True)
+    mesh = axes.pcolormesh(
+        x,
+        y,
+        np.ma.masked_invalid(np.maximum(error, 1e-300)),
+        cmap=colours,
+        shading="nearest",
+        norm=logarithmic_scale(FINEST, COARSEST),
+        rasterized=True,
+    )
     colour_bar(figure, axes, mesh, extend="both")
 
 
@@ -264,9 +287,14 @@ def _ndf(sheet: _Sheet) -> Page:
     families = sheet.families()[:3]
     mapped = families[:2]
     wide = 7.6 if len(mapped) == 1 else 2.9
-    maps = [panel for family in mapped for panel in (
-        Panel(partial(_ndf_error, sheet, family), wide, 0.95),
-        Panel(partial(_furnace_error, sheet, family), wide, 0.95))]
+    maps = [
+        panel
+        for family in mapped
+        for panel in (
+            Panel(partial(_ndf_error, sheet, family), wide, 0.95),
+            Panel(partial(_furnace_error, sheet, family), wide, 0.95),
+        )
+    ]
     return [*((3.1, _ndf_row(sheet, family)) for family in families), (2.9, maps)]
 
 
@@ -276,8 +304,9 @@ def _ndf_row(sheet: _Sheet, family: _Family) -> list[Panel]:
 
     def shape(axes: Axes) -> None:
         theta = np.radians(np.concatenate([np.geomspace(1e-3, 60, 260), np.linspace(60.5, 89.999, 90)]))
-        D = family.rows(_evaluate(device, "NDF_D", {"ndf": entry}, [np.cos(theta), np.sin(theta) ** 2],
-                                  {"ndf": family.columns}))
+        D = family.rows(
+            _evaluate(device, "NDF_D", {"ndf": entry}, [np.cos(theta), np.sin(theta) ** 2], {"ndf": family.columns})
+        )
         for values, colour, label in zip(D, colours, labels, strict=True):
             axes.loglog(np.degrees(theta), np.where(values > 0, values, np.nan), color=colour, label=label)
         axes.set(title="D, both axes logarithmic_scale", xlabel="θ (degrees)", ylabel="D (1/sr)", xlim=(1e-3, 90))
@@ -288,8 +317,9 @@ def _ndf_row(sheet: _Sheet, family: _Family) -> list[Panel]:
 
     def lobe(axes: Axes) -> None:
         theta = np.radians(np.concatenate([np.geomspace(1e-3, 10, 200), np.linspace(10.1, 89.999, 320)]))
-        D = family.rows(_evaluate(device, "NDF_D", {"ndf": entry}, [np.cos(theta), np.sin(theta) ** 2],
-                                  {"ndf": family.columns}))
+        D = family.rows(
+            _evaluate(device, "NDF_D", {"ndf": entry}, [np.cos(theta), np.sin(theta) ** 2], {"ndf": family.columns})
+        )
         for values, colour in zip(D, colours, strict=True):
             axes.plot(theta, values / values.max(), color=colour)
         axes.set_ylim(0, 1.02)
@@ -357,16 +387,24 @@ def _furnace_error(sheet: _Sheet, family: _Family, axes: Axes) -> None:
     NoV = np.geomspace(1e-3, 1, 48)
 
     def error(values: np.ndarray) -> np.ndarray:
-        got = integrate("weak_furnace", ndf=sheet.entry, NoV=NoV, device=sheet.device,
-                        **family.numbers(values[:, None])).values
+        got = integrate(
+            "weak_furnace", ndf=sheet.entry, NoV=NoV, device=sheet.device, **family.numbers(values[:, None])
+        ).values
         return np.abs(family.rows(got) - 1)
 
     _error_panel(sheet, family, axes, NoV, error, "Weak white furnace less 1", True)
     axes.set(xlim=(1e-3, 1), xlabel="n·v")
 
 
-def _error_panel(sheet: _Sheet, family: _Family, axes: Axes, x: np.ndarray,
-                 error: Callable[[np.ndarray], np.ndarray], what: str, log: bool) -> None:
+def _error_panel(
+    sheet: _Sheet,
+    family: _Family,
+    axes: Axes,
+    x: np.ndarray,
+    error: Callable[[np.ndarray], np.ndarray],
+    what: str,
+    log: bool,
+) -> None:
     """A map over x and the family's parameter, or lines where that has a single value."""
     p = family.parameter
     if p is None:
@@ -377,8 +415,11 @@ def _error_panel(sheet: _Sheet, family: _Family, axes: Axes, x: np.ndarray,
         y, log_y = _axis(p, family.values, 56)
         values = error(y)
         _map(sheet.figure, axes, x, y, values)
-        axes.set(yscale="log" if log_y else "linear", ylim=(y[0], y[-1]),
-                 ylabel=_symbol(p) + ("" if p.unit in ("", "1") else f" ({p.unit})"))
+        axes.set(
+            yscale="log" if log_y else "linear",
+            ylim=(y[0], y[-1]),
+            ylabel=_symbol(p) + ("" if p.unit in ("", "1") else f" ({p.unit})"),
+        )
     if log:
         axes.set_xscale("log")
     axes.set_title(f"{what}: {_largest(values)}", fontsize=11)
@@ -402,12 +443,18 @@ def _anisotropic(sheet: _Sheet) -> Page:
     def slopes(numbers: Numbers, last: bool, axes: Axes) -> None:
         D = _evaluate(device, "NDF_D", {"ndf": entry}, [-x / long, -y / long, 1 / long], {"ndf": numbers})
         share = np.maximum(D / D.max(), 1e-30)
-        mesh = axes.pcolormesh(slope, slope, share, cmap="inferno", norm=logarithmic_scale(1e-5, 1), shading="nearest",
-                               rasterized=True)
+        mesh = axes.pcolormesh(
+            slope, slope, share, cmap="inferno", norm=logarithmic_scale(1e-5, 1), shading="nearest", rasterized=True
+        )
         axes.contour(slope, slope, share, levels=[1e-4, 1e-3, 1e-2, 1e-1], colors="white", linewidths=0.6, alpha=0.6)
         axes.grid(False)
-        axes.set(xlabel="slope along x", ylabel="slope along y", xticks=[-1, -0.5, 0, 0.5, 1],
-                 yticks=[-1, -0.5, 0, 0.5, 1], title=f"D, {caption(numbers)}, peak {number_label(float(D.max()))} / sr")
+        axes.set(
+            xlabel="slope along x",
+            ylabel="slope along y",
+            xticks=[-1, -0.5, 0, 0.5, 1],
+            yticks=[-1, -0.5, 0, 0.5, 1],
+            title=f"D, {caption(numbers)}, peak {number_label(float(D.max()))} / sr",
+        )
         if last:
             colour_bar(figure, axes, mesh, "D / its peak", extend="min")
 
@@ -427,8 +474,9 @@ def _anisotropic(sheet: _Sheet) -> Page:
         _cosine_axis(axes)
 
     def albedo(axes: Axes) -> None:
-        E = integrate("albedo", ndf=entry, NoV=COSINES, phi=turns[:, None], tolerance=TOLERANCE, device=device,
-                      **numbers).values
+        E = integrate(
+            "albedo", ndf=entry, NoV=COSINES, phi=turns[:, None], tolerance=TOLERANCE, device=device, **numbers
+        ).values
         for values, colour, label in zip(E, colours, labels, strict=True):
             axes.plot(COSINES, values, color=colour, label=label)
         axes.set(title="Directional albedo, Smith, F = 1", ylim=(0, 1.03), ylabel="E")
@@ -458,10 +506,15 @@ def _anisotropic(sheet: _Sheet) -> Page:
         axes.set(xscale="log", xlabel="n·v", ylabel="φ (degrees)", yticks=[0, 30, 60, 90])
         axes.set_title(f"Weak white furnace less 1: {_largest(error)}", fontsize=11)
 
-    heat = [Panel(partial(slopes, n, n is sets[-1]), 4.4, 1.1 if n is sets[-1] else 0.3)
-            for n in sets]
-    return [(4.4, heat), (3.1, [Panel(masking, 2.8), Panel(albedo, 2.8, 1.25), Panel(shape_error, 2.6, 0.95),
-                                Panel(furnace, 2.6, 0.95)])]
+    heat = [Panel(partial(slopes, n, n is sets[-1]), 4.4, 1.1 if n is sets[-1] else 0.3) for n in sets]
+    return [
+        (4.4, heat),
+        (
+            3.1,
+            [Panel(masking, 2.8), Panel(albedo, 2.8, 1.25), Panel(shape_error, 2.6, 0.95), Panel(furnace, 2.6, 0.95)],
+        ),
+    ]
+
 
 DASHED = (0, (4, 2.5))
 
@@ -469,10 +522,17 @@ DASHED = (0, (4, 2.5))
 def _masking(sheet: _Sheet) -> Page:
     """G and V as v sweeps through the plane of l, and the energy they leave, against Smith's, for GGX."""
     rival = model("masking", RIVAL if sheet.entry.name == SMITH else SMITH)
-    return [(3.5, [Panel(partial(_sweep, sheet, alpha, rival, "G"), 4.2),
-                   Panel(partial(_sweep, sheet, alpha, rival, "V"), 4.2, 1.95),
-                   Panel(partial(_energy, sheet, alpha, rival), 3.6, 2.15)])
-            for alpha in (0.1, 0.5)]
+    return [
+        (
+            3.5,
+            [
+                Panel(partial(_sweep, sheet, alpha, rival, "G"), 4.2),
+                Panel(partial(_sweep, sheet, alpha, rival, "V"), 4.2, 1.95),
+                Panel(partial(_energy, sheet, alpha, rival), 3.6, 2.15),
+            ],
+        )
+        for alpha in (0.1, 0.5)
+    ]
 
 
 def _own(of: Model, alpha: float) -> dict[str, Any]:
@@ -497,13 +557,17 @@ def _sweep(sheet: _Sheet, alpha: float, rival: Model, function: str, axes: Axes)
                 want = of.reference[function](*given, **numbers["masking"])
         axes.plot(np.degrees(theta), curves[rival.name], color=colour, linestyle=DASHED, linewidth=1.3)
         axes.plot(np.degrees(theta), curves[sheet.entry.name], color=colour, label=rf"$\theta_l$ = {degrees}°")
-        axes.plot(np.degrees(theta)[17::36], want[17::36], "o", color="white", markeredgecolor=colour, markersize=5,
-                  zorder=4)
+        axes.plot(
+            np.degrees(theta)[17::36], want[17::36], "o", color="white", markeredgecolor=colour, markersize=5, zorder=4
+        )
     axes.plot([], [], color="0.3", linestyle=DASHED, linewidth=1.3, label=rival.name)
     axes.plot([], [], "o", color="white", markeredgecolor="0.3", markersize=5, label="float64 reference")
     _degrees(axes, -90, 90, 30, r"$\theta_v$ in the plane of l (degrees; + towards l)")
-    axes.set(ylabel=function, title=("Masking and shadowing, G" if function == "G" else "Visibility V = G / (n·l n·v)")
-             + f"; GGX, α = {alpha}")
+    axes.set(
+        ylabel=function,
+        title=("Masking and shadowing, G" if function == "G" else "Visibility V = G / (n·l n·v)")
+        + f"; GGX, α = {alpha}",
+    )
     if function == "G":
         axes.set_ylim(0, 1.05)
     else:
@@ -518,18 +582,29 @@ def _sweep(sheet: _Sheet, alpha: float, rival: Model, function: str, axes: Axes)
 
 def _energy(sheet: _Sheet, alpha: float, rival: Model, axes: Axes) -> None:
     entry = sheet.entry
-    for what, of, colour, style, width, label in (("albedo", entry, BLUE, "-", 2.0, f"E, {entry.name}"),
-                                                  ("albedo", rival, BLUE, DASHED, 1.3, f"E, {rival.name}"),
-                                                  ("weak_furnace", entry, RED, "-", 2.0, "weak white furnace")):
+    for what, of, colour, style, width, label in (
+        ("albedo", entry, BLUE, "-", 2.0, f"E, {entry.name}"),
+        ("albedo", rival, BLUE, DASHED, 1.3, f"E, {rival.name}"),
+        ("weak_furnace", entry, RED, "-", 2.0, "weak white furnace"),
+    ):
         if what == "albedo" or "MASKING_G1" in of.provides:
             own = {f"masking_{name}": value for name, value in _own(of, alpha).items()}
-            values = integrate(what, ndf=FACETS, masking=of, NoV=COSINES, device=sheet.device, tolerance=TOLERANCE,
-                               ndf_alpha=alpha, **own).values
+            values = integrate(
+                what,
+                ndf=FACETS,
+                masking=of,
+                NoV=COSINES,
+                device=sheet.device,
+                tolerance=TOLERANCE,
+                ndf_alpha=alpha,
+                **own,
+            ).values
             axes.plot(COSINES, values, color=colour, linestyle=style, linewidth=width, label=label)
     axes.set(title=f"Energy, F = 1; GGX, α = {alpha}", ylabel="share of the energy")
     axes.set_ylim(0, max(1.05, min(axes.get_ylim()[1], 3)))
     _cosine_axis(axes)
     add_legend(axes)
+
 
 INCIDENCE = np.radians(np.linspace(0, 90, 721))
 
@@ -568,16 +643,20 @@ def _fresnel(sheet: _Sheet) -> Page:
         panels.append(partial(_fresnel_error, sheet))
     # Presets have their legends in free corners; curves of any shape have them beside.
     columns, after = (3, 0.4) if metals else (2, 1.75)
-    rows = [panels[k:k + columns] for k in range(0, len(panels), columns)]
-    return [(3.3, [Panel(paint, 4.2, 1.0 if metals and k == columns - 1 else after) for k, paint in enumerate(row)])
-            for row in rows]
+    rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
+    return [
+        (3.3, [Panel(paint, 4.2, 1.0 if metals and k == columns - 1 else after) for k, paint in enumerate(row)])
+        for row in rows
+    ]
 
 
 def _preset(entry: Model, numbers: Mapping[str, float | tuple[float, float, float]]) -> dict[str, np.ndarray]:
     """Three of each parameter."""
     defaults = {p.name: p.default for p in entry.parameters}
-    return {p.name: np.broadcast_to(np.asarray(numbers.get(p.name, defaults[p.name]), np.float64), 3)
-            for p in entry.parameters}
+    return {
+        p.name: np.broadcast_to(np.asarray(numbers.get(p.name, defaults[p.name]), np.float64), 3)
+        for p in entry.parameters
+    }
 
 
 def _metal(sheet: _Sheet, name: str, numbers: Numbers, axes: Axes) -> None:
@@ -624,10 +703,24 @@ def _angles(sheet: _Sheet, family: _Family, axes: Axes) -> None:
         for n, colour in zip(family.values, shades(len(F)), strict=True):
             if n != 1:
                 theta = np.array([math.atan(n) if denser else math.asin(n)])
-                axes.plot(np.degrees(theta), _fresnel_of(sheet, entry, {**family.held, p.name: n}, theta),
-                          "o" if denser else "D", color=colour, markeredgecolor="white", markersize=8, zorder=5)
-        axes.plot([], [], "o" if denser else "D", color="0.35", markeredgecolor="white", markersize=8,
-                  label="Brewster's\nangle, tan θ = n" if denser else "critical angle,\nsin θ = n")
+                axes.plot(
+                    np.degrees(theta),
+                    _fresnel_of(sheet, entry, {**family.held, p.name: n}, theta),
+                    "o" if denser else "D",
+                    color=colour,
+                    markeredgecolor="white",
+                    markersize=8,
+                    zorder=5,
+                )
+        axes.plot(
+            [],
+            [],
+            "o" if denser else "D",
+            color="0.35",
+            markeredgecolor="white",
+            markersize=8,
+            label="Brewster's\nangle, tan θ = n" if denser else "critical angle,\nsin θ = n",
+        )
         title = "into the denser side, n ≥ 1" if denser else "into the thinner side, n < 1: total internal reflection"
     axes.set(title=title, ylim=(min(0, float(F.min()) * 1.1), max(1.03, float(F.max()) * 1.02)), ylabel="F")
     _degrees(axes)
@@ -665,8 +758,11 @@ def _against_schlick(sheet: _Sheet, axes: Axes) -> None:
     """What Schlick's curve of the same F(0°) would be off by."""
     schlick = model("fresnel", SCHLICK)
     family = sheet.families()[-1]
-    values = tuple(v for v in family.values if v >= 1) if family.parameter and family.parameter.name == "ior" \
+    values = (
+        tuple(v for v in family.values if v >= 1)
+        if family.parameter and family.parameter.name == "ior"
         else family.values
+    )
     family = _Family(family.parameter, values, family.held)
     F = _fresnel_of(sheet, sheet.entry, family.columns)
     for curve, colour, label in zip(F, shades(len(F)), family.labels(sheet.entry), strict=True):
@@ -700,8 +796,9 @@ def _diffuse(sheet: _Sheet) -> Page:
     families = sheet.families()[::-1][:2]
 
     def albedo(family: _Family, axes: Axes) -> None:
-        E = np.atleast_2d(integrate("albedo", diffuse=entry, NoV=COSINES, tolerance=TOLERANCE, device=device,
-                                    **family.columns).values)
+        E = np.atleast_2d(
+            integrate("albedo", diffuse=entry, NoV=COSINES, tolerance=TOLERANCE, device=device, **family.columns).values
+        )
         for value, values, colour, label in zip(family.values, E, shades(len(E)), family.labels(entry), strict=True):
             axes.plot(COSINES, values, color=colour, label=label)
             if "albedo" in entry.reference:
@@ -709,11 +806,13 @@ def _diffuse(sheet: _Sheet) -> Page:
                 want = np.broadcast_to(entry.reference["albedo"](dots, **family.numbers(value)), dots.shape)
                 axes.plot(dots, want, "o", color="white", markeredgecolor=colour, markersize=4.5)
         if "albedo" in entry.reference:
-            axes.plot([], [], "o", color="white", markeredgecolor="0.3", markersize=4.5,
-                      label="float64\nreference")
+            axes.plot([], [], "o", color="white", markeredgecolor="0.3", markersize=4.5, label="float64\nreference")
         axes.axhline(1, color="0.4", linewidth=1)
-        axes.set(title="Directional albedo" + (f" by {_symbol(family.parameter)}" if family.parameter else ""),
-                 ylabel="E", ylim=(0, float(np.clip(E.max() * 1.04, 1.05, 2.5))))
+        axes.set(
+            title="Directional albedo" + (f" by {_symbol(family.parameter)}" if family.parameter else ""),
+            ylabel="E",
+            ylim=(0, float(np.clip(E.max() * 1.04, 1.05, 2.5))),
+        )
         _cosine_axis(axes)
         add_legend(axes, family.caption(entry))
 
@@ -733,11 +832,16 @@ def _diffuse(sheet: _Sheet) -> Page:
         _degrees(axes, -90, 90, 30, r"$\theta_l$ in the plane of v (degrees; − towards v)")
 
     family = families[0]
-    shown = list(dict.fromkeys((family.values[min(1, len(family.values) - 1)], family.values[len(family.values) // 2],
-                                family.values[-1])))
+    shown = list(
+        dict.fromkeys(
+            (family.values[min(1, len(family.values) - 1)], family.values[len(family.values) // 2], family.values[-1])
+        )
+    )
     curves = [Panel(partial(albedo, f), 3.6, 1.5) for f in families]
-    slices = [Panel(partial(_slices, sheet, family, v, v == shown[-1]), 4.6,
-                     1.5 if v == shown[-1] else 0.3, polar=(-90, 90)) for v in shown]
+    slices = [
+        Panel(partial(_slices, sheet, family, v, v == shown[-1]), 4.6, 1.5 if v == shown[-1] else 0.3, polar=(-90, 90))
+        for v in shown
+    ]
     return [(3.4, [*curves, Panel(error, 3.9, 0.9)]), (2.3, slices)]
 
 
@@ -745,16 +849,31 @@ def _slices(sheet: _Sheet, family: _Family, value: float, legend: bool, axes: Ax
     theta = np.radians(np.linspace(-89.5, 89.5, 359))
     numbers = family.numbers(value)
     views = np.radians([0, 30, 60, 80])
-    f = math.pi * _evaluate(sheet.device, "DIFFUSE_F", {"diffuse": sheet.entry},
-                            [*_towards(theta), *_towards(-views[:, None])], {"diffuse": numbers})
+    f = math.pi * _evaluate(
+        sheet.device,
+        "DIFFUSE_F",
+        {"diffuse": sheet.entry},
+        [*_towards(theta), *_towards(-views[:, None])],
+        {"diffuse": numbers},
+    )
     top = float(np.clip(f.max() * 1.05, 0.2, 3))
     if "albedo" in numbers:
-        axes.plot(theta, np.full_like(theta, numbers["albedo"]), color="0.55", linestyle=(0, (3, 2)), linewidth=1.3,
-                  label="Lambert")
+        axes.plot(
+            theta,
+            np.full_like(theta, numbers["albedo"]),
+            color="0.55",
+            linestyle=(0, (3, 2)),
+            linewidth=1.3,
+            label="Lambert",
+        )
         top = max(top, numbers["albedo"] * 1.05)
     for values, view, colour in zip(f, views, shades(len(views)), strict=True):
-        axes.plot(theta, np.where((values >= 0) & (values <= top), values, np.nan), color=colour,
-                  label=rf"$\theta_v$ = {round(math.degrees(view))}°")
+        axes.plot(
+            theta,
+            np.where((values >= 0) & (values <= top), values, np.nan),
+            color=colour,
+            label=rf"$\theta_v$ = {round(math.degrees(view))}°",
+        )
         axes.plot([-view], [top], "v", color=colour, markersize=9, clip_on=False, zorder=6)
     axes.set_ylim(0, top)
     marks = [t for t in (0.5, 1, 1.5, 2, 2.5, 3) if t <= top]
@@ -777,21 +896,32 @@ def _brdf(sheet: _Sheet) -> Page:
         for k, ((channel, colour), style) in enumerate(zip(RGB.items(), styles, strict=True)):
             axes.plot(COSINES, E[:, k], color=colour, label=channel, linestyle=style)
         axes.axhline(1, color="0.4", linewidth=1)
-        axes.set(title="Directional albedo" + (f", {caption}" if caption else ""), ylabel="E",
-                 ylim=(0, float(np.clip(E.max() * 1.05, 1.05, 4))))
+        axes.set(
+            title="Directional albedo" + (f", {caption}" if caption else ""),
+            ylabel="E",
+            ylim=(0, float(np.clip(E.max() * 1.05, 1.05, 4))),
+        )
         _cosine_axis(axes)
         add_legend(axes)
 
     def plane(axes: Axes) -> None:
         theta, views = np.radians(np.linspace(-89.5, 89.5, 719)), np.radians([0, 30, 60, 80])
-        f = _evaluate(device, "BRDF_F", {"brdf": entry}, [*_towards(theta), *_towards(-views[:, None])],
-                      {"brdf": usual}).mean(0)
+        f = _evaluate(
+            device, "BRDF_F", {"brdf": entry}, [*_towards(theta), *_towards(-views[:, None])], {"brdf": usual}
+        ).mean(0)
         for values, view, colour in zip(f, views, shades(4), strict=True):
-            axes.semilogy(np.degrees(theta), np.where(values > 0, values, np.nan), color=colour,
-                          label=rf"$\theta_v$ = {round(math.degrees(view))}°")
+            axes.semilogy(
+                np.degrees(theta),
+                np.where(values > 0, values, np.nan),
+                color=colour,
+                label=rf"$\theta_v$ = {round(math.degrees(view))}°",
+            )
         top = float(np.nanmax(f[np.isfinite(f)], initial=1e-3))
-        axes.set(title="f in the plane of v, mean of RGB", ylabel="f (1/sr)",
-                 ylim=(max(float(np.min(f[f > 0], initial=top)) / 2, top * 1e-8), top * 2))
+        axes.set(
+            title="f in the plane of v, mean of RGB",
+            ylabel="f (1/sr)",
+            ylim=(max(float(np.min(f[f > 0], initial=top)) / 2, top * 1e-8), top * 2),
+        )
         _degrees(axes, -90, 90, 30, r"$\theta_l$ (degrees; − towards v)")
         add_legend(axes)
 
@@ -815,6 +945,11 @@ def _brdf(sheet: _Sheet) -> Page:
 
     return [(4.0, [Panel(albedo, 4.0, 1.1), Panel(plane, 4.8, 1.3), Panel(disc, 4.0, 1.2)])]
 
+
 _FIGURES: dict[str, Callable[[_Sheet], Page]] = {
-    "ndf": _ndf, "masking": _masking, "fresnel": _fresnel, "diffuse": _diffuse, "brdf": _brdf,
+    "ndf": _ndf,
+    "masking": _masking,
+    "fresnel": _fresnel,
+    "diffuse": _diffuse,
+    "brdf": _brdf,
 }

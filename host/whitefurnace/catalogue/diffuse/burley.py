@@ -1,4 +1,5 @@
 """Burley's diffuse of Disney's principled BRDF."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited

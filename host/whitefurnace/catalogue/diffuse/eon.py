@@ -1,4 +1,5 @@
 """EON, the energy-preserving Oren-Nayar."""
+
 import numpy as np
 
 from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
@@ -42,12 +43,20 @@ ENTRY = Model(
     slot="diffuse",
     name="eon",
     title="Energy-preserving Oren-Nayar (EON)",
-    citation=Paper("Portsmouth2025",
-                   "J. Portsmouth, P. Kutz, S. Hill, EON: A Practical Energy-Preserving Rough Diffuse BRDF, JCGT "
-                   "14(1), 2025"),
+    citation=Paper(
+        "Portsmouth2025",
+        "J. Portsmouth, P. Kutz, S. Hill, EON: A Practical Energy-Preserving Rough Diffuse BRDF, JCGT 14(1), 2025",
+    ),
     parameters=(
-        Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0),
-                  "albedo of a single scattering; that of the surface is a little less, but 1 for 1"),
+        Parameter(
+            "albedo",
+            "ρ",
+            "1",
+            0.0,
+            1.0,
+            (0.18, 0.8, 1.0),
+            "albedo of a single scattering; that of the surface is a little less, but 1 for 1",
+        ),
         Parameter("roughness", "r", "1", 0.0, 1.0, (0.0, 0.1, 0.5, 1.0), "roughness of the grooves, 0 is Lambert"),
     ),
     provides=("DIFFUSE_F",),

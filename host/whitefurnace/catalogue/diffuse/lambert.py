@@ -1,4 +1,5 @@
 """Lambert's diffuse."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited

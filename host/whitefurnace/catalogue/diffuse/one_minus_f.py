@@ -1,4 +1,5 @@
 """Lambert times what Schlick's Fresnel leaves at n·l: the plain form."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited

@@ -1,4 +1,5 @@
 """Lambert times what Schlick's Fresnel leaves at n·l and at n·v: the reciprocal form."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited

@@ -1,4 +1,5 @@
 """Oren and Nayar's full model."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
@@ -26,8 +27,9 @@ ENTRY = Model(
     citation=cited("OrenNayar1994"),
     parameters=(
         Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0), "albedo of the facets"),
-        Parameter("sigma", "σ", "rad", 0.0, np.pi / 2, (0.0, 0.1, 0.35, 0.8, 1.57),
-                  "standard deviation of the grooves' angle"),
+        Parameter(
+            "sigma", "σ", "rad", 0.0, np.pi / 2, (0.0, 0.1, 0.35, 0.8, 1.57), "standard deviation of the grooves' angle"
+        ),
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f},
@@ -36,6 +38,6 @@ ENTRY = Model(
     notes={
         "energy": "at most 1.0511 at NoV = 0 (albedo 1, σ = .304); above 1 for σ < .62, NoV < .31",
         "negative": "down to -.27 albedo/π where both directions graze on opposite sides, for σ near π/2 and "
-                    "albedo < .84",
+        "albedo < .84",
     },
 )

@@ -1,4 +1,5 @@
 """Oren and Nayar's two-coefficient model."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
@@ -21,8 +22,9 @@ ENTRY = Model(
     citation=cited("OrenNayar1994"),
     parameters=(
         Parameter("albedo", "ρ", "1", 0.0, 1.0, (0.18, 0.8, 1.0), "albedo of the facets"),
-        Parameter("sigma", "σ", "rad", 0.0, np.pi / 2, (0.0, 0.1, 0.35, 0.8, 1.57),
-                  "standard deviation of the grooves' angle"),
+        Parameter(
+            "sigma", "σ", "rad", 0.0, np.pi / 2, (0.0, 0.1, 0.35, 0.8, 1.57), "standard deviation of the grooves' angle"
+        ),
     ),
     provides=("DIFFUSE_F",),
     reference={"f": _f},

@@ -1,4 +1,5 @@
 """Fresnel's equations for a metal."""
+
 import numpy as np
 
 from whitefurnace.catalogue.model import Model, Paper, Parameter
@@ -18,13 +19,20 @@ ENTRY = Model(
     slot="fresnel",
     name="conductor",
     title="Fresnel, conductor",
-    citation=Paper("BornWolf1999",
-                   "M. Born, E. Wolf, Principles of Optics, 7th edition, Cambridge University Press, 1999"),
+    citation=Paper(
+        "BornWolf1999", "M. Born, E. Wolf, Principles of Optics, 7th edition, Cambridge University Press, 1999"
+    ),
     parameters=(
-        Parameter("eta", "η", "1", 1e-3, 20.0, (0.05, 0.2, 1.0, 2.5, 10.0),
-                  "real part of the metal's index over that of this side"),
-        Parameter("kappa", "κ", "1", 0.0, 30.0, (0.0, 1.0, 3.0, 10.0),
-                  "imaginary part of the same: the extinction"),
+        Parameter(
+            "eta",
+            "η",
+            "1",
+            1e-3,
+            20.0,
+            (0.05, 0.2, 1.0, 2.5, 10.0),
+            "real part of the metal's index over that of this side",
+        ),
+        Parameter("kappa", "κ", "1", 0.0, 30.0, (0.0, 1.0, 3.0, 10.0), "imaginary part of the same: the extinction"),
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
@@ -32,10 +40,14 @@ ENTRY = Model(
         "0°": lambda eta, kappa: (1.0, ((eta - 1) ** 2 + kappa**2) / ((eta + 1) ** 2 + kappa**2)),
         "90°": lambda eta, kappa: (0.0, np.where((eta == 1) & (kappa == 0), 0.0, 1.0)),
         # κ = 0 is a dielectric. Below η = .05 Brewster's angle is the critical one to 1e-3, where any rounding counts.
-        "Brewster's angle": lambda eta, kappa: (1 / np.hypot(1, eta), np.where(
-            (kappa == 0) & (eta >= 0.05), ((1 - eta**2) / (1 + eta**2)) ** 2 / 2, np.nan)),
-        "total internal reflection": lambda eta, kappa: (np.sqrt(np.maximum(1 - eta**2, 0)) / 2, np.where(
-            (kappa == 0) & (eta < 1), 1.0, np.nan)),
+        "Brewster's angle": lambda eta, kappa: (
+            1 / np.hypot(1, eta),
+            np.where((kappa == 0) & (eta >= 0.05), ((1 - eta**2) / (1 + eta**2)) ** 2 / 2, np.nan),
+        ),
+        "total internal reflection": lambda eta, kappa: (
+            np.sqrt(np.maximum(1 - eta**2, 0)) / 2,
+            np.where((kappa == 0) & (eta < 1), 1.0, np.nan),
+        ),
     },
     notes={
         "at 0°": "((η - 1)² + κ²)/((η + 1)² + κ²)",

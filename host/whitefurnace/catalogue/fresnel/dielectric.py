@@ -1,4 +1,5 @@
 """Fresnel's equations between two insulators."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
@@ -22,8 +23,15 @@ ENTRY = Model(
     title="Fresnel, dielectric",
     citation=cited("Walter2007"),
     parameters=(
-        Parameter("ior", "n", "1", 0.2, 5.0, (0.4, 0.75, 1.0, 1.333, 1.5, 2.417, 5.0),
-                  "index of the far side over that of this side; below 1 there is total internal reflection"),
+        Parameter(
+            "ior",
+            "n",
+            "1",
+            0.2,
+            5.0,
+            (0.4, 0.75, 1.0, 1.333, 1.5, 2.417, 5.0),
+            "index of the far side over that of this side; below 1 there is total internal reflection",
+        ),
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
@@ -33,8 +41,10 @@ ENTRY = Model(
         # tan θ = n, where r_p is 0 and r_s = (1 - n²)/(1 + n²).
         "Brewster's angle": lambda ior: (1 / np.hypot(1, ior), ((1 - ior**2) / (1 + ior**2)) ** 2 / 2),
         # cos θ of half the critical one's: sin²θ > n².
-        "total internal reflection": lambda ior: (np.sqrt(np.maximum(1 - ior**2, 0)) / 2,
-                                                  np.where(ior < 1, 1.0, np.nan)),
+        "total internal reflection": lambda ior: (
+            np.sqrt(np.maximum(1 - ior**2, 0)) / 2,
+            np.where(ior < 1, 1.0, np.nan),
+        ),
     },
     # The root at the critical angle of n < 1: rules gain less on one another than they are off.
     checks=Checks(slow_rules=6.0),

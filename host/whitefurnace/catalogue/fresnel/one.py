@@ -1,4 +1,5 @@
 """No Fresnel term: F = 1."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited

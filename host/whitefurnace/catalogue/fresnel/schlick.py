@@ -1,4 +1,5 @@
 """Schlick's approximation with f0 and f90."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
@@ -42,6 +43,6 @@ ENTRY = Model(
     reference={"F": _f},
     limits={"0°": lambda f0, f90: (1.0, f0), "90°": lambda f0, f90: (0.0, f90)},
     notes={"at 0°": "f0", "at 90°": "f90", "presets": "F(0°), linear, from the tables of [Hoffman2012]"},
-    presets={name: {"f0": f0} for name, f0 in _METALS.items()} |
-            {name: {"f0": (f0, f0, f0)} for name, f0 in _INSULATORS.items()},
+    presets={name: {"f0": f0} for name, f0 in _METALS.items()}
+    | {name: {"f0": (f0, f0, f0)} for name, f0 in _INSULATORS.items()},
 )

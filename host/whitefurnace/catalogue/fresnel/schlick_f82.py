@@ -1,4 +1,5 @@
 """Schlick's curve with a second reflectance of the metal, near grazing."""
+
 import numpy as np
 
 from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
@@ -16,12 +17,20 @@ ENTRY = Model(
     slot="fresnel",
     name="schlick_f82",
     title="Schlick with F82",
-    citation=Paper("Kutz2021",
-                   "P. Kutz, M. Hašan, E. Edmondson, Novel Aspects of the Adobe Standard Material, Adobe, 2021"),
+    citation=Paper(
+        "Kutz2021", "P. Kutz, M. Hašan, E. Edmondson, Novel Aspects of the Adobe Standard Material, Adobe, 2021"
+    ),
     parameters=(
         Parameter("f0", "F0", "1", 0.0, 1.0, (0.04, 0.56, 0.95, 1.0), "reflectance at normal incidence"),
-        Parameter("f82", "F82", "1", 0.0, 1.0, (0.3, 0.6, 0.9, 1.0),
-                  "reflectance at cos θ = 1/7 (81.8°); itself, not a tint of Schlick's"),
+        Parameter(
+            "f82",
+            "F82",
+            "1",
+            0.0,
+            1.0,
+            (0.3, 0.6, 0.9, 1.0),
+            "reflectance at cos θ = 1/7 (81.8°); itself, not a tint of Schlick's",
+        ),
     ),
     provides=("FRESNEL_F",),
     reference={"F": _f},
@@ -32,6 +41,6 @@ ENTRY = Model(
         "at 81.8°": "f82",
         "at 90°": "1",
         "range": "[0, 1] for f82 from 25/49 S to S, Schlick's S = f0 + (1 - f0)(6/7)⁵ at cos θ = 1/7; down to "
-                 "-.127 below (f0 = f82 = 0, at cos θ = .26) and up to 1.127 above (f0 = 0, f82 = 1, at .06)",
+        "-.127 below (f0 = f82 = 0, at cos θ = .26) and up to 1.127 above (f0 = 0, f82 = 1, at .06)",
     },
 )

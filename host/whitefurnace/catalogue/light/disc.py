@@ -1,4 +1,5 @@
 """A disc of constant radiance."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
@@ -25,11 +26,23 @@ ENTRY = Model(
     title="Disc",
     citation=cited("Hoffman2012"),
     parameters=(
-        *(Parameter(f"center_{axis}", f"c{axis}", "any length", -_FAR, _FAR, (typical,), f"{axis} of the centre")
-          for axis, typical in zip("xyz", (0.3, -0.2, 1.0), strict=True)),
-        *(Parameter(f"normal_{axis}", f"k{axis}", "any length", -_FAR, _FAR, (typical,),
-                    f"{axis} of the normal, of any length: the side that shines", default=down)
-          for axis, typical, down in zip("xyz", (0.1, 0.2, -1.0), (0.0, 0.0, -1.0), strict=True)),
+        *(
+            Parameter(f"center_{axis}", f"c{axis}", "any length", -_FAR, _FAR, (typical,), f"{axis} of the centre")
+            for axis, typical in zip("xyz", (0.3, -0.2, 1.0), strict=True)
+        ),
+        *(
+            Parameter(
+                f"normal_{axis}",
+                f"k{axis}",
+                "any length",
+                -_FAR,
+                _FAR,
+                (typical,),
+                f"{axis} of the normal, of any length: the side that shines",
+                default=down,
+            )
+            for axis, typical, down in zip("xyz", (0.1, 0.2, -1.0), (0.0, 0.0, -1.0), strict=True)
+        ),
         Parameter("radius", "R", "any length", 1e-6, _FAR, (0.1, 1.0), "that of the disc"),
         Parameter("radiance", "L", "W/(m²·sr)", 0.0, 1e30, (1.0,), "radiance of every point of it", default=1.0),
     ),

@@ -1,4 +1,5 @@
 """A punctual light."""
+
 import math
 
 import numpy as np
@@ -23,8 +24,16 @@ ENTRY = Model(
     parameters=(
         Parameter("NoL", "n·l", "1", -1.0, 1.0, (0.05, 0.5, 1.0), "cosine of the light's angle; below 0 it gives 0"),
         Parameter("phi_l", "φl", "rad", -1e6, 1e6, (0.0, math.pi / 2, math.pi), "azimuth of the light", default=0.0),
-        Parameter("color", "c", "W/(m²·sr)", 0.0, 1e30, (0.1, 1.0, 10.0),
-                  "radiance of a white Lambertian that faces the light", default=1.0),
+        Parameter(
+            "color",
+            "c",
+            "W/(m²·sr)",
+            0.0,
+            1e30,
+            (0.1, 1.0, 10.0),
+            "radiance of a white Lambertian that faces the light",
+            default=1.0,
+        ),
     ),
     provides=("LIGHT_C",),
     reference={"C": _c},

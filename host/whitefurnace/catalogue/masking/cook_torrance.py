@@ -1,4 +1,5 @@
 """Cook and Torrance's geometry factor of V-grooves."""
+
 import numpy as np
 
 from whitefurnace.catalogue.model import Checks, Model, Paper
@@ -22,8 +23,9 @@ ENTRY = Model(
     slot="masking",
     name="cook_torrance",
     title="Cook-Torrance",
-    citation=Paper("CookTorrance1982",
-                   "R. Cook, K. Torrance, A Reflectance Model for Computer Graphics, ACM TOG 1(1), 1982"),
+    citation=Paper(
+        "CookTorrance1982", "R. Cook, K. Torrance, A Reflectance Model for Computer Graphics, ACM TOG 1(1), 1982"
+    ),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},

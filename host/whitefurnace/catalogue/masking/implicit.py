@@ -1,4 +1,5 @@
 """No masking term at all: V = 1."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited

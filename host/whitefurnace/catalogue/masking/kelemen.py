@@ -1,4 +1,5 @@
 """Kelemen and Szirmay-Kalos' visibility, 1/(v·h)²."""
+
 import numpy as np
 
 from whitefurnace.catalogue.model import Checks, Model, Paper
@@ -16,9 +17,11 @@ ENTRY = Model(
     slot="masking",
     name="kelemen",
     title="Kelemen-Szirmay-Kalos",
-    citation=Paper("Kelemen2001",
-                   "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with "
-                   "Importance Sampling, Eurographics short presentations, 2001"),
+    citation=Paper(
+        "Kelemen2001",
+        "C. Kelemen, L. Szirmay-Kalos, A Microfacet Based Coupled Specular-Matte BRDF Model with "
+        "Importance Sampling, Eurographics short presentations, 2001",
+    ),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},

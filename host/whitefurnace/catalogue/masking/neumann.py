@@ -1,4 +1,5 @@
 """Neumann's G = min(n·l, n·v)."""
+
 import numpy as np
 
 from whitefurnace.catalogue.model import Checks, Model, Paper
@@ -18,8 +19,9 @@ ENTRY = Model(
     slot="masking",
     name="neumann",
     title="Neumann",
-    citation=Paper("Neumann1999",
-                   "L. Neumann, A. Neumann, L. Szirmay-Kalos, Compact Metallic Reflectance Models, CGF 18(3), 1999"),
+    citation=Paper(
+        "Neumann1999", "L. Neumann, A. Neumann, L. Szirmay-Kalos, Compact Metallic Reflectance Models, CGF 18(3), 1999"
+    ),
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},

@@ -1,4 +1,5 @@
 """Schlick's approximation of a Smith term, by its own roughness."""
+
 import math
 
 import numpy as np
@@ -35,8 +36,15 @@ ENTRY = Model(
     title="Schlick's approximation of Smith",
     citation=cited("Schlick1994"),
     parameters=(
-        Parameter("alpha", "α", "1", 1e-5, 1.0, (1e-4, 0.01, 0.1, 0.5, 1.0),
-                  "roughness, the square of the perceptual one; that of the NDF, unless something else is wanted"),
+        Parameter(
+            "alpha",
+            "α",
+            "1",
+            1e-5,
+            1.0,
+            (1e-4, 0.01, 0.1, 0.5, 1.0),
+            "roughness, the square of the perceptual one; that of the NDF, unless something else is wanted",
+        ),
     ),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G", "MASKING_G1"),
     reference={"V": _v, "G": _g, "G1": _g1},
@@ -46,9 +54,9 @@ ENTRY = Model(
         "follows roughness": True,
         # Below Smith everywhere but at n·v = 1, at grazing by Smith's slope over this one's: A(0)/(α√(2/π)).
         "G1 less Smith's": "Beckmann: -.455, -.441, -.388, -.335 at most for α = .01, .1, .5, 1 "
-                           "(at n·v = .006, .06, .24, .39); GGX: -.270, -.249, -.177, -.116 (at .010, .09, .30, .39)",
+        "(at n·v = .006, .06, .24, .39); GGX: -.270, -.249, -.177, -.116 (at .010, .09, .30, .39)",
         "weak furnace, deviation": "Beckmann: down to -.646, 1/√8 - 1, at grazing for every α; "
-                                   "GGX: to -.388, -.380, -.373, -.373 for α = .01, .1, .5, 1",
+        "GGX: to -.388, -.380, -.373, -.373 for α = .01, .1, .5, 1",
         "caution": "not the Smith term of any NDF: it approximates another function [Hoffman2012]; use smith",
     },
 )

@@ -1,4 +1,5 @@
 """Smith's masking-shadowing, height-correlated, for any NDF."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited

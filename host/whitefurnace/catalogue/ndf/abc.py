@@ -1,4 +1,5 @@
 """ABC: a power of 1 + b(1 - cos θ)."""
+
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
@@ -6,10 +7,24 @@ from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
 from whitefurnace.catalogue.numerics import expm1_ratio
 from whitefurnace.catalogue.roughness import alpha_within
 
-B = Parameter("b", "B", "1", 0.0, 1e8, (0.0, 1e-3, 1.0, 30.0, 1e4, 1e6, 1e8),
-              "how narrow: D bends at 1 - cos θ = 1/b; 0 is the uniform lobe")
-C = Parameter("c", "C", "1", 0.0, 16.0, (0.0, 0.5, 1.0, 1.3, 2.0, 3.0, 16.0),
-              "how steep: D falls like (1 - cos θ)^-c; 0 is the uniform lobe")
+B = Parameter(
+    "b",
+    "B",
+    "1",
+    0.0,
+    1e8,
+    (0.0, 1e-3, 1.0, 30.0, 1e4, 1e6, 1e8),
+    "how narrow: D bends at 1 - cos θ = 1/b; 0 is the uniform lobe",
+)
+C = Parameter(
+    "c",
+    "C",
+    "1",
+    0.0,
+    16.0,
+    (0.0, 0.5, 1.0, 1.3, 2.0, 3.0, 16.0),
+    "how steep: D falls like (1 - cos θ)^-c; 0 is the uniform lobe",
+)
 # α at which b of GGX's peak, 2(1/α² - 1), is the largest.
 _ALPHA = Parameter("alpha", "α", "1", (2 / (B.high + 2)) ** 0.5, 1.0, (), "GGX's α of the same peak")
 
@@ -49,9 +64,10 @@ ENTRY = Model(
     slot="ndf",
     name="abc",
     title="ABC",
-    citation=Paper("Low2012",
-                   "J. Löw et al., BRDF Models for Accurate and Efficient Rendering of Glossy Surfaces, ACM TOG "
-                   "31(1), 2012"),
+    citation=Paper(
+        "Low2012",
+        "J. Löw et al., BRDF Models for Accurate and Efficient Rendering of Glossy Surfaces, ACM TOG 31(1), 2012",
+    ),
     parameters=(B, C),
     provides=("NDF_D", "NDF_WIDTH", "NDF_REACH"),
     reference={"D": _d},
@@ -63,9 +79,9 @@ ENTRY = Model(
     notes={
         "tail": "D falls like (1 - cos θ)^-c",
         "float32": "relative error of D at most 3.5e-6 where D > 1e-7 of its peak; 2.5e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-38 of it",
+        "0 below 1e-38 of it",
         "quadrature": "normalization within 3e-7 and 9e-15, weak furnace with Smith within 1e-6 and 2e-13 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "uniform at b = 0 or c = 0; the norm is regular at c = 1 and c = 2",
     },
 )

@@ -1,4 +1,5 @@
 """Beckmann."""
+
 import math
 
 import numpy as np
@@ -7,8 +8,15 @@ from whitefurnace.catalogue.bibliography import cited
 from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
-ALPHA = Parameter("alpha", "α", "1", 1e-5, 1.0, (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 1.0),
-                  "roughness, √2 times the standard deviation of the slopes; the square of the perceptual one")
+ALPHA = Parameter(
+    "alpha",
+    "α",
+    "1",
+    1e-5,
+    1.0,
+    (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 1.0),
+    "roughness, √2 times the standard deviation of the slopes; the square of the perceptual one",
+)
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
@@ -42,9 +50,9 @@ ENTRY = Model(
         "projected area": "closed, with erf",
         "tail": "D falls like exp(-tan²θ/α²)",
         "float32": "relative error of D at most 5.5e-6 where D > 1e-7 of its peak; 6e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-34 of it",
+        "0 below 1e-34 of it",
         "quadrature": "normalization within 3e-7 and 3e-15, weak furnace with Smith within 1e-6 and 2e-14 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "D is 0 at grazing for every α",
     },
 )

@@ -1,4 +1,5 @@
 """Anisotropic Beckmann."""
+
 import math
 
 import numpy as np
@@ -8,9 +9,17 @@ from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
 ALPHA_X, ALPHA_Y = (
-    Parameter(f"alpha_{axis}", f"α{axis}", "1", 1e-4, 1.0, (1e-4, 0.01, 0.2, 1.0),
-              f"roughness along {axis}, √2 times the standard deviation of the slopes")
-    for axis in "xy")
+    Parameter(
+        f"alpha_{axis}",
+        f"α{axis}",
+        "1",
+        1e-4,
+        1.0,
+        (1e-4, 0.01, 0.2, 1.0),
+        f"roughness along {axis}, √2 times the standard deviation of the slopes",
+    )
+    for axis in "xy"
+)
 _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
@@ -45,9 +54,9 @@ ENTRY = Model(
         "projected area": "closed, with erf",
         "tail": "D falls like exp(-tan²θ/α²)",
         "float32": "relative error of D at most 8e-6 where D > 1e-7 of its peak; 7e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-34 of it",
+        "0 below 1e-34 of it",
         "quadrature": "normalization within 4e-7 and 5e-15, weak furnace with Smith within 1e-6 and 2e-13 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "D is 0 at grazing for every α",
     },
 )

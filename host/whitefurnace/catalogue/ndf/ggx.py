@@ -1,12 +1,14 @@
 """GGX (Trowbridge-Reitz)."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
 from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
-ALPHA = Parameter("alpha", "α", "1", 1e-5, 1.0, (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 1.0),
-                  "roughness, the square of the perceptual one")
+ALPHA = Parameter(
+    "alpha", "α", "1", 1e-5, 1.0, (1e-4, 1e-3, 0.01, 0.05, 0.2, 0.5, 1.0), "roughness, the square of the perceptual one"
+)
 
 
 def _d(theta_m, alpha):
@@ -39,7 +41,7 @@ ENTRY = Model(
         "tail": "D falls like 1/sin⁴θ",
         "float32": "relative error of D at most 8e-7",
         "quadrature": "normalization within 3e-7 and 4e-15, weak furnace with Smith within 1e-6 and 2e-14 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "uniform at α = 1",
     },
 )

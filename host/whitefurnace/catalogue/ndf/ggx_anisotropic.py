@@ -1,4 +1,5 @@
 """Anisotropic GGX."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
@@ -7,7 +8,8 @@ from whitefurnace.catalogue.roughness import alpha_within
 
 ALPHA_X, ALPHA_Y = (
     Parameter(f"alpha_{axis}", f"α{axis}", "1", 1e-4, 1.0, (1e-4, 0.01, 0.2, 1.0), f"roughness along {axis}")
-    for axis in "xy")
+    for axis in "xy"
+)
 
 
 def _alpha2(phi, alpha_x, alpha_y):
@@ -46,7 +48,7 @@ ENTRY = Model(
         "tail": "D falls like 1/sin⁴θ",
         "float32": "relative error of D at most 8.5e-7",
         "quadrature": "normalization within 3e-7 and 2e-14, weak furnace with Smith within 1.1e-6 and 2e-13 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "uniform at α = 1",
     },
 )

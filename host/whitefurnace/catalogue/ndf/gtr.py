@@ -1,4 +1,5 @@
 """Generalized Trowbridge-Reitz."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
@@ -6,10 +7,18 @@ from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.numerics import expm1_ratio
 from whitefurnace.catalogue.roughness import alpha_within
 
-ALPHA = Parameter("alpha", "α", "1", 1e-4, 1.0, (1e-4, 1e-3, 0.01, 0.1, 0.5, 1.0),
-                  "roughness, the square of the perceptual one")
-GAMMA = Parameter("gamma", "γ", "1", 0.0, 10.0, (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 10.0),
-                  "steepness of the tail: 2 is GGX, 1 Burley's clearcoat, 0 the uniform lobe")
+ALPHA = Parameter(
+    "alpha", "α", "1", 1e-4, 1.0, (1e-4, 1e-3, 0.01, 0.1, 0.5, 1.0), "roughness, the square of the perceptual one"
+)
+GAMMA = Parameter(
+    "gamma",
+    "γ",
+    "1",
+    0.0,
+    10.0,
+    (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 10.0),
+    "steepness of the tail: 2 is GGX, 1 Burley's clearcoat, 0 the uniform lobe",
+)
 
 
 def _constants(alpha, gamma):
@@ -52,9 +61,9 @@ ENTRY = Model(
     notes={
         "tail": "D falls like sin^-2γ θ",
         "float32": "relative error of D at most 3e-6 where D > 1e-7 of its peak; 3e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-38 of it",
+        "0 below 1e-38 of it",
         "quadrature": "normalization within 4e-7 and 7e-15, weak furnace with Smith within 1e-6 and 2e-13 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "GGX at γ = 2; uniform at γ = 0 or α = 1; the norm is regular at γ = 1",
     },
 )

@@ -1,12 +1,20 @@
 """Phong, as an NDF."""
+
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
 from whitefurnace.catalogue.model import Checks, Model, Parameter
 from whitefurnace.catalogue.roughness import alpha_within, exponent_of_alpha
 
-EXPONENT = Parameter("exponent", "n", "1", 0.0, 1e6, (0.0, 1.0, 10.0, 100.0, 1e4, 1e6),
-                     "power of the cosine, 2/α² - 2; 0 is the uniform lobe")
+EXPONENT = Parameter(
+    "exponent",
+    "n",
+    "1",
+    0.0,
+    1e6,
+    (0.0, 1.0, 10.0, 100.0, 1e4, 1e6),
+    "power of the cosine, 2/α² - 2; 0 is the uniform lobe",
+)
 # α of the largest exponent.
 _ALPHA = Parameter("alpha", "α", "1", (2 / (EXPONENT.high + 2)) ** 0.5, 1.0, (), "Beckmann's α of the same peak")
 
@@ -32,9 +40,9 @@ ENTRY = Model(
     notes={
         "tail": "D falls like cosⁿθ, to 0 at grazing",
         "float32": "relative error of D at most 4e-6 where D > 1e-7 of its peak; 2.5e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-38 of it",
+        "0 below 1e-38 of it",
         "quadrature": "normalization within 2e-7 and 4e-15, weak furnace with Smith within 1e-6 and 4e-12 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "uniform at n = 0",
     },
 )

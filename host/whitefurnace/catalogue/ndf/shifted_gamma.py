@@ -1,14 +1,23 @@
 """The shifted-gamma NDF."""
+
 import numpy as np
 from numpy.polynomial.legendre import leggauss
 
 from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
 from whitefurnace.catalogue.roughness import alpha_within
 
-ALPHA = Parameter("alpha", "α", "1", 1e-4, 1.0, (1e-4, 1e-3, 0.01, 0.1, 0.5, 1.0),
-                  "roughness: the power law bends at tan θ = α, the exponential at tan²θ = α")
-P = Parameter("p", "p", "1", 0.0, 2.0, (0.0, 0.5, 1.0, 1.5, 2.0),
-              "steepness of the power law; 0 is Beckmann of roughness √α")
+ALPHA = Parameter(
+    "alpha",
+    "α",
+    "1",
+    1e-4,
+    1.0,
+    (1e-4, 1e-3, 0.01, 0.1, 0.5, 1.0),
+    "roughness: the power law bends at tan θ = α, the exponential at tan²θ = α",
+)
+P = Parameter(
+    "p", "p", "1", 0.0, 2.0, (0.0, 0.5, 1.0, 1.5, 2.0), "steepness of the power law; 0 is Beckmann of roughness √α"
+)
 
 NODES = 64
 
@@ -47,9 +56,11 @@ ENTRY = Model(
     slot="ndf",
     name="shifted_gamma",
     title="Shifted gamma",
-    citation=Paper("Bagher2012",
-                   "M. Bagher, C. Soler, N. Holzschuch, Accurate Fitting of Measured Reflectances Using a Shifted "
-                   "Gamma Micro-facet Distribution, CGF 31(4), 2012"),
+    citation=Paper(
+        "Bagher2012",
+        "M. Bagher, C. Soler, N. Holzschuch, Accurate Fitting of Measured Reflectances Using a Shifted "
+        "Gamma Micro-facet Distribution, CGF 31(4), 2012",
+    ),
     parameters=(ALPHA, P),
     provides=("NDF_D", "NDF_WIDTH", "NDF_REACH"),
     reference={"D": _d},
@@ -61,9 +72,9 @@ ENTRY = Model(
     notes={
         "tail": "D falls like exp(-tan²θ/α), before it like (α² + tan²θ)^-p",
         "float32": "relative error of D at most 5.5e-6 where D > 1e-7 of its peak; 5e-7 (1 + |log(D/peak)|) below, "
-                   "0 below 1e-34 of it",
+        "0 below 1e-34 of it",
         "quadrature": "normalization within 3e-7 and 8e-15, weak furnace with Smith within 1e-6 and 2e-13 "
-                      "(float32 and float64), over the domain and n·v from 0 to 1",
+        "(float32 and float64), over the domain and n·v from 0 to 1",
         "limits": "Beckmann of roughness √α at p = 0; the norm is regular for p ≥ 1",
     },
 )

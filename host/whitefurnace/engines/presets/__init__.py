@@ -2,6 +2,7 @@
 
 A new preset is one new module and touches nothing else. A user's own engine is the same description in a TOML file.
 """
+
 from __future__ import annotations
 
 import importlib
@@ -36,8 +37,9 @@ from whitefurnace.errors import FileError, InputError, UsageError, nearest
 
 def _presets() -> dict[str, Preset]:
     """Every preset by the name of its module, in the order that they state."""
-    found = {info.name: importlib.import_module(f"{__name__}.{info.name}").PRESET
-             for info in pkgutil.iter_modules(__path__)}
+    found = {
+        info.name: importlib.import_module(f"{__name__}.{info.name}").PRESET for info in pkgutil.iter_modules(__path__)
+    }
     return dict(sorted(found.items(), key=lambda one: (one[1].order, one[0])))
 
 
@@ -65,6 +67,7 @@ def engines(names: str) -> tuple[Engine, ...]:
 
 def as_text(engine: Engine) -> str:
     """The TOML of an engine that `user_engine` reads: the fields that differ from the defaults."""
+
     def value(x: Any) -> str:
         if isinstance(x, bool):
             return str(x).lower()
@@ -74,11 +77,18 @@ def as_text(engine: Engine) -> str:
 
     def lines(one: msgspec.Struct, left_out: Sequence[str] = ()) -> list[str]:
         usual = dict(zip(one.__struct_fields__[::-1], one.__struct_defaults__[::-1], strict=False))
-        return [f"{name} = {value(getattr(one, name))}" for name in one.__struct_fields__ if name not in left_out and
-                getattr(one, name) is not None and (name not in usual or getattr(one, name) != usual[name])]
+        return [
+            f"{name} = {value(getattr(one, name))}"
+            for name in one.__struct_fields__
+            if name not in left_out
+            and getattr(one, name) is not None
+            and (name not in usual or getattr(one, name) != usual[name])
+        ]
 
-    text = [f"# {engine.name}: {engine.facts}",
-            *lines(engine, ("name", "facts", "proven", "container", "latlong", "without", "dfg", "file"))]
+    text = [
+        f"# {engine.name}: {engine.facts}",
+        *lines(engine, ("name", "facts", "proven", "container", "latlong", "without", "dfg", "file")),
+    ]
     if table := lines(engine.dfg):
         text += ["", "[dfg]", *table]
     for file in engine.file:
@@ -147,11 +157,30 @@ def _tables(data: dict[str, Any]) -> list[tuple[str, dict[str, Any], Sequence[st
     if isinstance(data.get("dfg"), dict):
         found.append(("dfg.", data["dfg"], Dfg.__struct_fields__))
     if isinstance(data.get("file"), list):
-        found += [(f"file[{k}].", one, File.__struct_fields__) for k, one in enumerate(data["file"])
-                  if isinstance(one, dict)]
+        found += [
+            (f"file[{k}].", one, File.__struct_fields__) for k, one in enumerate(data["file"]) if isinstance(one, dict)
+        ]
     return found
 
 
-__all__ = ["ENGINES", "FORMATS", "HOLDS", "PRESETS", "REDUCIBLE", "SH_SCALES", "SUFFIXES", "Dfg", "Engine", "File",
-           "Holds", "Preset", "Published", "as_text", "axes_matrix", "engine_of_data", "engines", "reduced",
-           "user_engine"]
+__all__ = [
+    "ENGINES",
+    "FORMATS",
+    "HOLDS",
+    "PRESETS",
+    "REDUCIBLE",
+    "SH_SCALES",
+    "SUFFIXES",
+    "Dfg",
+    "Engine",
+    "File",
+    "Holds",
+    "Preset",
+    "Published",
+    "as_text",
+    "axes_matrix",
+    "engine_of_data",
+    "engines",
+    "reduced",
+    "user_engine",
+]

@@ -1,4 +1,5 @@
 """Preset of Filament."""
+
 from __future__ import annotations
 
 from whitefurnace.engines.engine import Dfg, Engine, File, Preset, Published
@@ -11,13 +12,22 @@ PRESET = Preset(
         facts="loaded and rendered by its WASM build, whose least roughness is .089; its desktop builds have .045",
         proven=True,
         # A level more than its own tool makes: what is read between levels errs by .6 to .7 of that.
-        bend="alpha * alpha", least=0.045, min_size=8, sh="filament",
+        bend="alpha * alpha",
+        least=0.045,
+        min_size=8,
+        sh="filament",
         dfg=Dfg(128, form="multiscatter", charlie=True),
         shading="scaled",
-        file=(File("specular", "{stem}_ibl.ktx", "b10g11r11"), File("skybox", "{stem}_skybox.ktx", "b10g11r11"),
-              File("sh", "{stem}_sh.txt"), File("dfg", "{stem}_dfg.ktx2", "rgba16f", 19)),
-        steps=("ibl = engine.createIblFromKtx1(STEM_ibl.ktx); engine.createSkyFromKtx1(STEM_skybox.ktx)",
-               "its harmonics too, in JavaScript: IndirectLight.Builder().reflections(ibl.getReflectionsTexture())"
-               ".irradianceSh(3, ibl.shfloats).build(engine)"),
+        file=(
+            File("specular", "{stem}_ibl.ktx", "b10g11r11"),
+            File("skybox", "{stem}_skybox.ktx", "b10g11r11"),
+            File("sh", "{stem}_sh.txt"),
+            File("dfg", "{stem}_dfg.ktx2", "rgba16f", 19),
+        ),
+        steps=(
+            "ibl = engine.createIblFromKtx1(STEM_ibl.ktx); engine.createSkyFromKtx1(STEM_skybox.ktx)",
+            "its harmonics too, in JavaScript: IndirectLight.Builder().reflections(ibl.getReflectionsTexture())"
+            ".irradianceSh(3, ibl.shfloats).build(engine)",
+        ),
     ),
 )

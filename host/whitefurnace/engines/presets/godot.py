@@ -1,4 +1,5 @@
 """Preset of Godot 4."""
+
 from __future__ import annotations
 
 import math
@@ -10,9 +11,13 @@ PRESET = Preset(
     published=Published(levels=5, width=256, lod=math.sqrt(0.5) * 4, bend=0.25),
     engine=Engine(
         title="Godot 4: a panorama that it filters itself",
-        facts=READ_IN_ITS_SOURCE, lod="sqrt(r) * max_lod", bend="alpha",
+        facts=READ_IN_ITS_SOURCE,
+        lod="sqrt(r) * max_lod",
+        bend="alpha",
         file=(File("environment", "{stem}.hdr"),),
-        steps=("import STEM.hdr as a PanoramaSkyMaterial's panorama; the sky is filtered by the engine, of our work "
-               "its energy, its turn and its extracted sun survive",),
+        steps=(
+            "import STEM.hdr as a PanoramaSkyMaterial's panorama; the sky is filtered by the engine, of our work "
+            "its energy, its turn and its extracted sun survive",
+        ),
     ),
 )

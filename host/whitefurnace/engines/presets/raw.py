@@ -1,4 +1,5 @@
 """Preset of this project's own arrays, one .npz an environment."""
+
 from __future__ import annotations
 
 from whitefurnace.engines.engine import Engine, Preset
@@ -7,7 +8,8 @@ PRESET = Preset(
     order=10,
     engine=Engine(
         title="numpy arrays in one .npz, GL-direct faces",
-        container="npz", facts="this project's own",
+        container="npz",
+        facts="this project's own",
         proven=True,
     ),
 )

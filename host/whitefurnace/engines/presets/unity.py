@@ -1,4 +1,5 @@
 """Preset of Unity."""
+
 from __future__ import annotations
 
 from whitefurnace.engines.engine import READ_IN_COPIES, Engine, File, Preset, Published
@@ -8,10 +9,14 @@ PRESET = Preset(
     published=Published(levels=7, width=256, lod=4.05, diffuse_lod=6),
     engine=Engine(
         title="Unity: a lat-long that it filters on import, and the chain as a DDS cube",
-        facts=READ_IN_COPIES, lod="6 * r * (1.7 - 0.7 * r)", levels=7,
+        facts=READ_IN_COPIES,
+        lod="6 * r * (1.7 - 0.7 * r)",
+        levels=7,
         file=(File("environment", "{stem}.exr"), File("specular", "{stem}_cube.dds", "rgba16f")),
-        steps=("import STEM.exr with Texture Shape: Cube, Mapping: Latitude-Longitude, Convolution Type: Specular; it "
-               "is filtered then, and of our work its energy, its turn and its extracted sun survive",
-               "with Convolution Type: None it stays; Cubemap.SetPixelData can set the levels of STEM_cube.dds"),
+        steps=(
+            "import STEM.exr with Texture Shape: Cube, Mapping: Latitude-Longitude, Convolution Type: Specular; it "
+            "is filtered then, and of our work its energy, its turn and its extracted sun survive",
+            "with Convolution Type: None it stays; Cubemap.SetPixelData can set the levels of STEM_cube.dds",
+        ),
     ),
 )

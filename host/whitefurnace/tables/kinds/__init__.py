@@ -2,6 +2,7 @@
 
 A new kind is one new module and touches nothing else. Listing loads no numpy: see `tables/kind.py`.
 """
+
 from __future__ import annotations
 
 import importlib

@@ -1,4 +1,5 @@
 """Split-sum tables, of our own layout or of an engine's."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -40,8 +41,9 @@ class SplitSum(OfIntegral):
             if value:
                 raise UsageError(f"--for {found[0].name} says the {what}: leave it out")
         table = found[0].dfg
-        axes: dict[str, AxisSpec] = {name: (0.0, 1.0, table.size, table.NoV if name == "NoV" else "centres")
-                                     for name in (table.x, table.y)}
+        axes: dict[str, AxisSpec] = {
+            name: (0.0, 1.0, table.size, table.NoV if name == "NoV" else "centres") for name in (table.x, table.y)
+        }
         return replace(self, engine=table), replace(request, size=table.size, scheme=table.form, axes=axes)
 
     def arranged(self, axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
@@ -63,8 +65,9 @@ class SplitSum(OfIntegral):
         if not self.charlie:
             return found
         cloth: dict[str, Any] = charlie(cells)
-        return replace(found, shape=(*found.shape[:-1], 3),
-                       digests=(*found.digests, *table_spec("albedo", **cloth).digests))
+        return replace(
+            found, shape=(*found.shape[:-1], 3), digests=(*found.digests, *table_spec("albedo", **cloth).digests)
+        )
 
     def make(self, cells: Cells, run: Run, report: bool) -> tuple[Integrated, Facts]:
         from whitefurnace.tables.split_sum import CHANNELS, charlie, laid_out

@@ -1,4 +1,5 @@
 """Tables of pre-integrated diffusion: diffuse light on a curved body under whose surface light travels."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -19,11 +20,28 @@ if TYPE_CHECKING:
 class Diffusion(Kind):
     name = "diffusion"
     summary = "Diffuse light on skin and other media, by curvature"
-    help = ("x is NoL from -1 to 1 and y the curvature from 0 to 1 per mm. `skin` is a sum of Gaussians, `burley` and "
-            "`dipole` take absorption and scattering, burley also albedo and mfp, with --set; the other schemes are "
-            "measured media.")
-    schemes = ("skin", "burley", "dipole", "apple", "chicken1", "chicken2", "cream", "ketchup", "marble", "potato",
-               "skimmilk", "skin1", "skin2", "spectralon", "wholemilk")
+    help = (
+        "x is NoL from -1 to 1 and y the curvature from 0 to 1 per mm. `skin` is a sum of Gaussians, `burley` and "
+        "`dipole` take absorption and scattering, burley also albedo and mfp, with --set; the other schemes are "
+        "measured media."
+    )
+    schemes = (
+        "skin",
+        "burley",
+        "dipole",
+        "apple",
+        "chicken1",
+        "chicken2",
+        "cream",
+        "ketchup",
+        "marble",
+        "potato",
+        "skimmilk",
+        "skin1",
+        "skin2",
+        "spectralon",
+        "wholemilk",
+    )
     on_device = False
     # Of the table's size.
     usual_axes: Mapping[str, Ends] = {"NoL": (-1.0, 1.0, 0, "centres"), "curvature": (0.0, 1.0, 0, "centres")}
@@ -39,11 +57,15 @@ class Diffusion(Kind):
     def default_axes(self, size: Size) -> dict[str, Axis]:
         return {}
 
-    def with_usual_axes(self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float],
-                        size: Size) -> dict[str, AxisSpec]:
+    def with_usual_axes(
+        self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float], size: Size
+    ) -> dict[str, AxisSpec]:
         counts = dict(zip(self.usual_axes, (size.across, size.down), strict=True))
-        own: dict[str, AxisSpec] = {name: (low, high, counts[name], scale)
-                                    for name, (low, high, _, scale) in self.usual_axes.items() if name not in fixed}
+        own: dict[str, AxisSpec] = {
+            name: (low, high, counts[name], scale)
+            for name, (low, high, _, scale) in self.usual_axes.items()
+            if name not in fixed
+        }
         return {**own, **axes}
 
     def spec(self, cells: Cells) -> TableSpec:

@@ -1,4 +1,5 @@
 """Tables of the energy that single scattering loses, in the forms of three schemes that give it back."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -14,8 +15,10 @@ if TYPE_CHECKING:
 class Energy(Kind):
     name = "energy"
     summary = "Energy of multiple scattering, for three ways to restore it"
-    help = ("kulla_conty: 1 - E and 1 - E_avg; turquin: E and 1/E - 1; fdez_aguera: the split-sum pair, E being the "
-            "directional albedo.")
+    help = (
+        "kulla_conty: 1 - E and 1 - E_avg; turquin: E and 1/E - 1; fdez_aguera: the split-sum pair, E being the "
+        "directional albedo."
+    )
     schemes = ("kulla_conty", "turquin", "fdez_aguera")
 
     def integral(self, scheme: str | None) -> str:
@@ -29,10 +32,12 @@ class Energy(Kind):
     def lines(self, manifest: Mapping[str, Any]) -> list[str]:
         if "furnace" not in manifest:
             return []
-        return [f"  furnace at F = 1: off by {manifest['furnace']:.1e}; "
-                f"f(l, v) and f(v, l) differ by {manifest['non_reciprocity']:.2g}",
-                "  off Kulla and Conty's at F0 = " +
-                ", ".join(f"{f0}: {off:.1e}" for f0, off in manifest["deviation"].items())]
+        return [
+            f"  furnace at F = 1: off by {manifest['furnace']:.1e}; "
+            f"f(l, v) and f(v, l) differ by {manifest['non_reciprocity']:.2g}",
+            "  off Kulla and Conty's at F0 = "
+            + ", ".join(f"{f0}: {off:.1e}" for f0, off in manifest["deviation"].items()),
+        ]
 
 
 KINDS = (Energy(),)

@@ -1,4 +1,5 @@
 """Tables of the average of a Fresnel term over the hemisphere."""
+
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
@@ -28,12 +29,14 @@ class FresnelAverage(Kind):
 
     def specs(self, request: TableRequest) -> dict[str, Spec]:
         if (request.ndf, request.masking, request.diffuse, request.brdf) != (None,) * 4:
-            raise UnsupportedError(f"{self.name} is of Fresnel's term alone: give a fresnel, and no ndf, masking, "
-                                   "diffuse or brdf")
+            raise UnsupportedError(
+                f"{self.name} is of Fresnel's term alone: give a fresnel, and no ndf, masking, diffuse or brdf"
+            )
         return {"fresnel": request.fresnel or self.fresnel}
 
-    def with_usual_axes(self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float],
-                        size: Size) -> dict[str, AxisSpec]:
+    def with_usual_axes(
+        self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float], size: Size
+    ) -> dict[str, AxisSpec]:
         from whitefurnace.tables.axes import over_first_parameter
 
         return dict(axes or over_first_parameter(models["fresnel"], fixed, size.across))

@@ -1,4 +1,5 @@
 """Tables of rough glass: what a boundary of two insulators reflects and lets through."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -18,8 +19,10 @@ if TYPE_CHECKING:
 class Glass(Kind):
     name = "glass"
     summary = "Light that a rough boundary reflects and transmits"
-    help = ("The third axis is the index of refraction, from 1 to 3. `entering` is for light from the side of index 1, "
-            "`leaving` for light from the other side.")
+    help = (
+        "The third axis is the index of refraction, from 1 to 3. `entering` is for light from the side of index 1, "
+        "`leaving` for light from the other side."
+    )
     schemes = ("entering", "leaving")
     fresnel = "dielectric"
     # Equal steps of F0^¼ = √((n - 1)/(n + 1)), as Cycles has them, to OSPRay's largest index.

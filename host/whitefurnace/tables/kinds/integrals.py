@@ -1,4 +1,5 @@
 """Tables of the integrals of the catalogue themselves: what `whitefurnace.integrate` gives, over a grid."""
+
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -26,10 +27,16 @@ class OfIntegral(Kind):
         if ndf is None and request.diffuse is None and request.brdf is None:
             ndf = self.ndf
         if ndf is None and (request.masking is not None or request.fresnel is not None):
-            raise UsageError(f"{'masking' if request.masking is not None else 'fresnel'} is of an NDF, and none is "
-                             "given")
-        given = {"ndf": ndf, "masking": request.masking or "smith", "fresnel": request.fresnel or self.fresnel,
-                 "diffuse": request.diffuse, "brdf": request.brdf}
+            raise UsageError(
+                f"{'masking' if request.masking is not None else 'fresnel'} is of an NDF, and none is given"
+            )
+        given = {
+            "ndf": ndf,
+            "masking": request.masking or "smith",
+            "fresnel": request.fresnel or self.fresnel,
+            "diffuse": request.diffuse,
+            "brdf": request.brdf,
+        }
         return {slot: spec for slot, spec in given.items() if spec is not None}
 
     def spec(self, cells: Cells) -> TableSpec:

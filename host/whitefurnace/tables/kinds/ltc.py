@@ -1,4 +1,5 @@
 """Tables of linearly transformed cosines: matrices that light polygons, and the two textures that engines load."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -50,8 +51,9 @@ class Ltc(Kind):
     def make(self, cells: Cells, run: Run, report: bool) -> tuple[Integrated, Facts]:
         from whitefurnace.tables.ltc import ltc
 
-        return ltc(self.name, self.names, cells.scheme, report, middle=cells.middle(), **cells.arguments,
-                   **run.arguments)
+        return ltc(
+            self.name, self.names, cells.scheme, report, middle=cells.middle(), **cells.arguments, **run.arguments
+        )
 
     def lines(self, manifest: Mapping[str, Any]) -> list[str]:
         if "misplaced" not in manifest:
@@ -59,8 +61,12 @@ class Ltc(Kind):
         stated = {f"at texels, {k}": e for k, e in manifest["misplaced"].items() if k != "between"}
         stated |= {f"between, {k}": e for k, e in manifest["misplaced"].get("between", {}).items()}
         names = ("mean", "median", "p99", "max")
-        return [table(["  energy misplaced", *names],
-                      [(f"  {where}", *(f"{e[k]:.3f}" for k in names)) for where, e in stated.items()])]
+        return [
+            table(
+                ["  energy misplaced", *names],
+                [(f"  {where}", *(f"{e[k]:.3f}" for k in names)) for where, e in stated.items()],
+            )
+        ]
 
 
 _SCHEMES = ("free", "heitz")

@@ -1,4 +1,5 @@
 """The norm of an NDF as a polynomial, written as C and GLSL."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -30,8 +31,9 @@ class Norm(Kind):
     def usual_tolerance(self, request: TableRequest) -> float | None:
         return self.tolerance
 
-    def with_usual_axes(self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float],
-                        size: Size) -> dict[str, AxisSpec]:
+    def with_usual_axes(
+        self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float], size: Size
+    ) -> dict[str, AxisSpec]:
         from whitefurnace.tables.axes import usual_beside
         from whitefurnace.tables.curves import norm_axes
 

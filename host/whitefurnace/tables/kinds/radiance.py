@@ -1,4 +1,5 @@
 """Tables of the radiance that a surface reflects from a light or an environment."""
+
 from __future__ import annotations
 
 import math
@@ -33,16 +34,25 @@ class Radiance(OfIntegral):
             raise UsageError("integral radiance needs either a light or an environment")
         if light is not None:
             if request.normal is not None or request.rotate or request.exposure:
-                raise UsageError("normal, rotate and exposure are of an environment; a light lies in the surface's "
-                                 "frame")
+                raise UsageError(
+                    "normal, rotate and exposure are of an environment; a light lies in the surface's frame"
+                )
             return Lighting({"light": chosen("light", light)})
         assert around is not None
-        env = environment(around, rotate=request.rotate, exposure=request.exposure,
-                          nonfinite=request.nonfinite)  # type: ignore[arg-type]  # a string from the command line
+        env = environment(around, rotate=request.rotate, exposure=request.exposure, nonfinite=request.nonfinite)  # type: ignore[arg-type]  # a string from the command line
         up = (0.0, 1.0, 0.0) if request.normal is None else tuple(map(float, request.normal))
-        return Lighting({"environment": env, "normal": up}, {"environment": {
-            "sha256": env.digest, "rotate": round(math.degrees(env.rotation), 9), "exposure": env.exposure,
-            "nonfinite": request.nonfinite, "normal": list(up)}})
+        return Lighting(
+            {"environment": env, "normal": up},
+            {
+                "environment": {
+                    "sha256": env.digest,
+                    "rotate": round(math.degrees(env.rotation), 9),
+                    "exposure": env.exposure,
+                    "nonfinite": request.nonfinite,
+                    "normal": list(up),
+                }
+            },
+        )
 
     def spec(self, cells: Cells) -> TableSpec:
         from whitefurnace.integrals.radiance import radiance_spec

@@ -1,4 +1,5 @@
 """Tables of the albedo of a sheen, for the scaling of the layer under it."""
+
 from __future__ import annotations
 
 from typing import TYPE_CHECKING

@@ -1,4 +1,5 @@
 """Smith's term of any NDF as a rational function, written as C and GLSL."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -27,8 +28,9 @@ class Smith(Kind):
     def integral(self, scheme: str | None) -> str:
         return "projected_area"
 
-    def with_usual_axes(self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float],
-                        size: Size) -> dict[str, AxisSpec]:
+    def with_usual_axes(
+        self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float], size: Size
+    ) -> dict[str, AxisSpec]:
         from whitefurnace.tables.axes import following, usual_beside
 
         follows = any(following(choice, {*fixed, *axes}) for choice in models.values())
