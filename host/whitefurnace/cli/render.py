@@ -296,14 +296,14 @@ def side_by_side_text(made: SideBySide) -> str:
     return "\n".join(
         [
             rendered_text(made),
-            f"  truth   samples {' '.join(map(str, made.samples))} a pixel, within {max(made.estimates):.1e} of four times "
-            f"as many; {seconds}",
+            f"  truth   samples {' '.join(map(str, made.samples))} a pixel, within {max(made.estimates):.1e} of four "
+            f"times as many; {seconds}",
             *(
                 f"  error   roughness {held.roughness:.3g}, n·v {held.NoV:.2f}, {held.of}: {held.error:.1e} of "
                 f"{' '.join(f'{x:.4g}' for x in held.exact)} by quadrature"
                 for held in made.certificate
             ),
-            f"  differs by {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of 100; "
-            f"the colours reach {100 * made.scale:g} %",
+            f"  differs by {100 * made.median:.3g} % or less at half of the pixels, {100 * made.most:.3g} % at 95 of "
+            f"100; the colours reach {100 * made.scale:g} %",
         ]
     )

@@ -1,4 +1,4 @@
-"""ASTC blocks of 4 x 4 HDR texels, coded and decoded by the optional package `astc-encoder-py`, Arm's own codec."""
+"""Encodes and decodes ASTC blocks of 4 x 4 HDR texels with Arm's codec, the optional package `astc-encoder-py`."""
 
 from __future__ import annotations
 
@@ -16,10 +16,14 @@ QUALITY = 98.0
 
 
 def encode_astc(values: npt.ArrayLike, *, quality: float = QUALITY) -> Packed:
-    """`values` (..., height, width, 3 | 4) as HDR blocks, a fourth channel too: uint8 (..., blocks down, blocks across,
-    16). `quality` is astcenc's, 0 to 100. Values too large for a half become 65504 and negative ones, which HDR blocks
-    do not have, 0, and both are counted. Raises `InputError` for NaN, `UnsupportedError` where astc-encoder-py is not
-    installed."""
+    """Encode `values` (..., height, width, 3 | 4) as ASTC HDR blocks: uint8 (..., blocks down, blocks across, 16).
+
+    quality: astcenc's, 0 to 100. A fourth channel is HDR too. Values too large for a half become 65504, and negative
+    values, which HDR blocks cannot hold, become 0; `Packed` counts both.
+
+    Raises `InputError` for NaN, and `UnsupportedError` for a quality out of range and where astc-encoder-py is not
+    installed.
+    """
     if not 0 <= quality <= 100:
         raise UnsupportedError(f"a quality of {quality:g} of ASTC is not between 0 and 100")
     astc = library()
@@ -40,8 +44,11 @@ def encode_astc(values: npt.ArrayLike, *, quality: float = QUALITY) -> Packed:
 
 
 def decode_astc(data: bytes | memoryview, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
-    """The blocks `data` as float32 (*shape, 4), `shape` (..., height, width) in texels; blocks that are not valid are
-    NaN, as on a GPU. Raises `UnsupportedError` where astc-encoder-py is not installed."""
+    """Decode ASTC blocks to float32 (*shape, 4); blocks that are not valid become NaN, as on a GPU.
+
+    data: the bytes of the blocks. shape: (..., height, width) in texels. Raises `UnsupportedError` where
+    astc-encoder-py is not installed, and `InputError` for blocks that it cannot decode.
+    """
     astc = library()
     height, width = shape[-2:]
     size = -(-height // SIDE) * -(-width // SIDE) * FORMATS["astc4x4hdr"].size
@@ -67,7 +74,9 @@ def _context(astc: Any, quality: float, flags: int) -> Any:
 
 
 def library() -> Any:
-    """The codec's module. Raises `UnsupportedError` with the sentence that names the extra where it is missing."""
+    """Return the module of the codec. Raises `UnsupportedError`, which names the extra to install, where it is
+    missing.
+    """
     try:
         import astc_encoder
     except ImportError:

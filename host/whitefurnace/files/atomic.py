@@ -1,4 +1,4 @@
-"""Files that are whole or not there: written beside their target, synced, then renamed over it."""
+"""Writes files that are either complete or absent: each is written next to its target, synced, then renamed."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ from whitefurnace.errors import FileError
 
 
 class Transaction:
-    """Several files that appear together or not at all: each is staged beside its target, and `commit` renames
-    them in the order they were staged. Leaving the block before the first rename, for whatever reason, removes
-    what was staged and leaves every target as it was; stopped between two renames, what is still staged stays,
-    the manifest with it, and tells the next run whose the renamed files are."""
+    """A context in which several files are written that appear together or not at all.
+
+    `stage` writes each file next to its target, and `commit` renames all of them in the same order, the manifest last.
+    If the block ends before the first rename, the staged files are removed and every target stays as it was. If it ends
+    between two renames, the remaining staged files stay: the staged manifest then proves to the next run that the
+    renamed files are ours.
+    """
 
     def __init__(self) -> None:
         self._targets: list[Path] = []
@@ -24,11 +27,11 @@ class Transaction:
 
     @staticmethod
     def staging(path: Path) -> Path:
-        """The temporary name of a target."""
+        """Return the temporary path of a target: `.NAME.tmp` in the same folder."""
         return path.with_name(f".{path.name}.tmp")
 
     def stage(self, path: Path, writer: Callable[[Path], object]) -> None:
-        """Let `writer` write the temporary file of `path`, and sync it. Raises `FileError`."""
+        """Call `writer` with the temporary path of `path`, and sync the file that it writes. Raises `FileError`."""
         temporary = self.staging(path)
         self._targets.append(path)
         try:
@@ -41,12 +44,15 @@ class Transaction:
             raise FileError(f"cannot write {path}: {error.strerror or error}") from error
 
     def staged(self, path: Path) -> Path:
-        """Where the staged bytes of `path` are until `commit`."""
+        """Return the path of the staged bytes of `path`, valid until `commit`."""
         return self.staging(path)
 
     def commit(self, stale: Iterable[Path] = ()) -> None:
-        """Rename every staged file to its target; before the last, the manifest, remove what is `stale`: the manifest
-        that proves it ours is there until then. Raises `FileError`."""
+        """Rename every staged file to its target, in the order in which they were staged.
+
+        stale: files that are removed just before the last rename, that of the manifest. Until then the old manifest
+        proves that they are ours. Raises `FileError` where a file cannot be renamed.
+        """
         while self._targets:
             path = self._targets[0]
             for old in stale if len(self._targets) == 1 else ():
@@ -75,10 +81,11 @@ class Transaction:
 def write_atomic(
     path: str | os.PathLike[str], writer: Callable[[Path], object], into: Transaction | None = None
 ) -> None:
-    """Let `writer` write `.NAME.tmp` beside `path`, sync it and rename it to `path`, or stage it in `into`.
+    """Call `writer` with the path `.NAME.tmp` next to `path`, sync that file and rename it to `path`.
 
-    Whatever is raised on the way, Ctrl-C too, the temporary file is removed and an existing target is left as
-    it was. Raises `FileError` where the system refuses; what else `writer` raises passes through.
+    into: a transaction in which the file is staged instead. After any exception, also Ctrl-C, the temporary file is
+    removed and an existing target is unchanged. Raises `FileError` where the system refuses; other exceptions of
+    `writer` pass through.
     """
     if into is not None:
         into.stage(Path(path), writer)
@@ -91,7 +98,7 @@ def write_atomic(
 def write_pieces(
     path: str | os.PathLike[str], pieces: Iterable[bytes | memoryview], into: Transaction | None = None
 ) -> None:
-    """`write_atomic` of bytes, piece by piece."""
+    """Write `pieces` one after the other as a file, as `write_atomic` does. Raises `FileError`."""
 
     def write(temporary: Path) -> None:
         with open(temporary, "wb") as file:
@@ -101,7 +108,7 @@ def write_pieces(
 
 
 def digest_file(path: str | os.PathLike[str]) -> str:
-    """sha256 of a file's bytes in hex. Raises `FileError` where it cannot be read."""
+    """Return the sha256 of a file's bytes in hex. Raises `FileError` where it cannot be read."""
     digest = hashlib.sha256()
     try:
         with open(path, "rb") as file:

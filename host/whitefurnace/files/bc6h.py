@@ -1,4 +1,4 @@
-"""BC6H blocks: encoded by the optional package `ispc-texcomp`, decoded by OpenImageIO from a DDS made for it."""
+"""Encodes BC6H blocks with the optional package `ispc-texcomp`, and decodes them with OpenImageIO."""
 
 from __future__ import annotations
 
@@ -19,9 +19,13 @@ Profile = Literal["veryfast", "fast", "basic", "slow", "veryslow"]
 
 
 def encode_bc6h(values: npt.ArrayLike, *, profile: Profile = "slow") -> Packed:
-    """`values` (..., height, width, 3) as unsigned BC6H: uint8 (..., blocks down, blocks across, 16). Rows and columns
-    that do not fill a block are repeated into it. Values too large for a half become 65504 and negative ones 0, and
-    both are counted. Raises `InputError` for NaN, `UnsupportedError` where ispc-texcomp is not installed."""
+    """Encode `values` (..., height, width, 3) as unsigned BC6H: uint8 (..., blocks down, blocks across, 16).
+
+    profile: quality of the encoder. The last rows and columns are repeated to fill whole blocks. Values too large for a
+    half become 65504 and negative values become 0; `Packed` counts both.
+
+    Raises `InputError` for NaN, and `UnsupportedError` for another profile and where ispc-texcomp is not installed.
+    """
     if profile not in get_args(Profile):
         raise UnsupportedError(f"there is no profile {profile!r} of BC6H; known: {', '.join(get_args(Profile))}")
     ispc_texcomp = library()
@@ -46,7 +50,9 @@ def encode_bc6h(values: npt.ArrayLike, *, profile: Profile = "slow") -> Packed:
 
 
 def library() -> Any:
-    """The encoder's module. Raises `UnsupportedError` with the sentence that names the extra where it is missing."""
+    """Return the module of the encoder. Raises `UnsupportedError`, which names the extra to install, where it is
+    missing.
+    """
     try:
         import ispc_texcomp
     except ImportError:
@@ -55,8 +61,11 @@ def library() -> Any:
 
 
 def decode_bc6h(form: str, data: bytes | memoryview, shape: tuple[int, ...]) -> npt.NDArray[np.float32]:
-    """The blocks `data` of the format `form` ("bc6hu" or "bc6hs") as float32 (*shape, 3), `shape` (..., height, width)
-    in texels. Raises `FileError` where OpenImageIO cannot."""
+    """Decode BC6H blocks to float32 (*shape, 3).
+
+    form: "bc6hu" (unsigned) or "bc6hs" (signed). data: the bytes of the blocks. shape: (..., height, width) in texels.
+    Raises `FileError` where OpenImageIO cannot decode them.
+    """
     import OpenImageIO as oiio
 
     height, width = shape[-2:]

@@ -20,7 +20,7 @@ MAX_BYTES = 8 << 30
 
 
 class Source:
-    """The bytes of a file. `name` begins the messages of its errors."""
+    """The bytes of a file with bounds-checked access. `name` begins the messages of its errors."""
 
     def __init__(self, data: Buffer, name: str) -> None:
         self.view = memoryview(data)

@@ -1,4 +1,4 @@
-"""Turns floats into a texture of any pixel format, and a texture into the floats that a GPU reads of it."""
+"""Encodes floats as a texture of any pixel format, and decodes a texture to the floats that a GPU reads from it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,11 @@ ASTC = "astc4x4hdr"
 
 @dataclass(frozen=True)
 class Encoded:
-    """A texture made of floats, and per level how many values were `clipped` and how many `negative` became 0."""
+    """A texture that was encoded from floats.
+
+    clipped   for each level, the number of values too large for the format
+    negative  for each level, the number of negative values that became 0
+    """
 
     texture: Texture
     clipped: tuple[int, ...]
@@ -49,9 +53,14 @@ def encode(
     key_values: Mapping[str, bytes] | None = None,
     orientation: str = "rd",
 ) -> Encoded:
-    """A texture of the format `form` from `levels` of floats, each ([layers,] [6,] height, width, channels); the 6 are
-    there exactly where `cube` is true. Raises `InputError` for NaN, `UnsupportedError` for signed BC6H, which is not
-    encoded, for `bc6hu` without ispc-texcomp and for `astc4x4hdr` without astc-encoder-py."""
+    """Encode levels of floats as a texture of the pixel format `form`.
+
+    levels: arrays ([layers,] [6,] height, width, channels) with halving sizes, level 0 first. cube: True if they have
+    the axis of 6 faces. key_values, orientation: those of the `Texture`.
+
+    Raises `InputError` for NaN, and `UnsupportedError` for signed BC6H, which is not encoded, and for "bc6hu" and
+    "astc4x4hdr" where the package of the encoder is not installed.
+    """
     arrays = [np.asarray(level) for level in levels]
     if not arrays:
         raise ValueError("a texture has at least one level")
@@ -92,9 +101,9 @@ def _pack(form: str, array: npt.NDArray[np.generic]) -> Packed:
 
 
 def decode(texture: Texture, k: int) -> npt.NDArray[np.float32]:
-    """Level k of `texture` as a GPU reads it: float32 ([layers,] [6,] height, width, channels).
+    """Decode level k of `texture` as a GPU reads it: float32 ([layers,] [6,] height, width, channels).
 
-    Raises `UnsupportedError` for ASTC without astc-encoder-py.
+    Raises `UnsupportedError` for ASTC where astc-encoder-py is not installed.
     """
     width, height = texture.extent(k)
     shape = (*([texture.layers] if texture.layers else []), *([6] if texture.cube else []), height, width)

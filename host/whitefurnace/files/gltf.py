@@ -38,7 +38,7 @@ Codes = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
 
 
 class Gltf:
-    """An opened glTF file. `document` is its JSON; `take` reads values of it and checks their type and range."""
+    """An opened glTF file. `document` is its JSON; `take` reads values from it and checks their type and range."""
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Open the file. Raises `FileError` where it cannot be read, and `InputError` where it is not glTF 2."""

@@ -97,7 +97,7 @@ def gltf_text(lights: Sequence[GltfLight]) -> tuple[str, int, int]:
             {
                 **({"name": light.name} if light.name else {}),
                 "rotation": list(light.rotation),
-                "intensity": light.intensity,  # always written: without it Babylon.js multiplies by undefined, which is NaN
+                "intensity": light.intensity,  # without it Babylon.js multiplies by undefined, which is NaN
                 "irradianceCoefficients": np.asarray(light.coefficients, np.float64).tolist(),
                 "specularImageSize": light.size,
                 "specularImages": mips,

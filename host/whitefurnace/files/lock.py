@@ -1,4 +1,7 @@
-"""One writer an output: a lock file that the system lets go of when its holder dies, and what such a death leaves."""
+"""Locks an output, so that one process at a time writes it, and finds what a killed process left there.
+
+The operating system releases the lock when the process that holds it ends for any reason.
+"""
 
 from __future__ import annotations
 
@@ -27,12 +30,15 @@ _FIRST, _LAST = 0.02, 0.5
 
 
 def lock_path(manifest: Path) -> Path:
-    """The lock of the output whose manifest is at `STEM.json`: `.STEM.lock` beside it."""
+    """Return the path of the lock file of an output: `.STEM.lock` in the folder of its manifest `STEM.json`."""
     return manifest.with_name(f".{manifest.name.removesuffix('.json')}{_SUFFIX}")
 
 
 def is_safe(relative: Any) -> bool:
-    """Whether a manifest's name of a file stays in its folder: no absolute path, no `..`, no drive."""
+    """Return whether a file name in a manifest or lock is a text that stays in its folder.
+
+    It may not be absolute and may not contain `..`, a drive or a backslash.
+    """
     if not isinstance(relative, str) or not relative or "\\" in relative or ":" in relative.split("/")[0][1:2]:
         return False
     path = PurePosixPath(relative)
@@ -40,9 +46,14 @@ def is_safe(relative: Any) -> bool:
 
 
 class Lock:
-    """A held lock. `left` names what a holder that died may have left staged, `waited` tells that another held it.
+    """A lock that this process holds.
 
-    The file is removed while the lock is held; who opened it before finds by its inode that it is no longer the lock.
+    path    the lock file
+    left    names of the files that a killed holder may have left staged
+    waited  True if another process held the lock first
+
+    The file is removed while the lock is held. A process that opened it before compares the inode and sees that this
+    file is no longer the lock.
     """
 
     def __init__(self, path: Path, handle: int, left: tuple[str, ...], waited: bool) -> None:
@@ -50,7 +61,10 @@ class Lock:
         self._handle: int | None = handle
 
     def note(self, targets: Iterable[Path]) -> None:
-        """Writes down what is about to be staged, for who finds this lock after a death. Raises FileError."""
+        """Write the names of files that will be staged into the lock file, for the next run in case this one is killed.
+
+        targets: paths in the folder of the lock or below. Raises FileError where the lock file cannot be written.
+        """
         names = sorted({*self.left, *(t.relative_to(self.path.parent).as_posix() for t in targets)})
         data = json.dumps({"whitefurnace": names}).encode()
         assert self._handle is not None
@@ -62,7 +76,7 @@ class Lock:
             raise FileError(f"cannot write {self.path}: {error.strerror or error}") from error
 
     def sweep(self, keep: Collection[Path] = ()) -> None:
-        """Removes what a dead holder left staged, but for `keep`."""
+        """Remove the staged files that a killed holder left, except those in `keep`."""
         for name in self.left:
             staged = Transaction.staging(self.path.parent / name)
             if is_safe(name) and staged not in keep and staged.is_file() and not staged.is_symlink():
@@ -70,7 +84,7 @@ class Lock:
                     staged.unlink()
 
     def release(self) -> None:
-        """Removes the file and lets go; again it does nothing."""
+        """Remove the lock file and release the lock. A second call does nothing."""
         if self._handle is None:
             return
         handle, self._handle = self._handle, None
@@ -84,8 +98,11 @@ class Lock:
 
 
 def acquire(path: Path, *, wait: bool = True, folder: bool = False) -> Lock | None:
-    """The lock at `path`; None where another has it and `wait` is false. `folder`: make its folder where it is missing.
-    Raises FileError where it cannot be made, or is a file that is not ours."""
+    """Take the lock at `path` and return it, or None where another process holds it and `wait` is False.
+
+    wait: wait until the lock is free. folder: create the folder of the lock where it is missing.
+    Raises FileError where the file cannot be created, or exists and is not a lock of this tool.
+    """
     pause, waited, missing = _FIRST, False, 0
     while True:
         try:
@@ -135,7 +152,7 @@ def _try(handle: int) -> bool:
 
 
 def _same(handle: int, path: Path) -> bool:
-    """Whether the open file is still the one of that name."""
+    """Return whether the open file is still the one at `path`."""
     try:
         return os.path.samestat(os.fstat(handle), os.stat(path, follow_symlinks=False))
     except FileNotFoundError:
@@ -158,7 +175,7 @@ def _left(path: Path, handle: int) -> tuple[str, ...]:
 
 
 def is_lock(path: Path) -> bool:
-    """Whether a file is one of our locks, by what a holder noted in it."""
+    """Return whether a file is a lock of this tool, judged by its first bytes; False where it cannot be read."""
     try:
         with open(path, "rb") as file:
             return file.read(len(_BEGIN)) == _BEGIN
@@ -167,7 +184,7 @@ def is_lock(path: Path) -> bool:
 
 
 def locks_in(folder: Path) -> list[Path]:
-    """The lock files in a folder."""
+    """List the lock files in a folder, sorted; empty where the folder cannot be read."""
     try:
         with os.scandir(folder) as entries:
             return sorted(folder / e.name for e in entries if e.name.startswith(".") and e.name.endswith(_SUFFIX))

@@ -1,4 +1,4 @@
-"""Reads and writes the manifest: the JSON file, written last, that proves the rest of an output whole."""
+"""Reads and writes manifests. A manifest is a JSON file, written last, that proves the files of an output complete."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ _MAX_BYTES = 64 << 20
 
 
 def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
-    """The manifest at `path`, or None where there is none or the file is not one of ours (a JSON object with
-    the key `whitefurnace`). Raises `FileError` for a file that is there and cannot be read."""
+    """Read the manifest at `path`; None where no file is there or the file is not a manifest of this tool.
+
+    A manifest is a JSON object with the key `whitefurnace`. Raises `FileError` for a file that exists and cannot be
+    read.
+    """
     path = Path(path)
     try:
         if not path.is_file() or path.stat().st_size > _MAX_BYTES:
@@ -35,8 +38,11 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
 def write_manifest(
     path: str | os.PathLike[str], manifest: Mapping[str, Any], *, into: Transaction | None = None
 ) -> None:
-    """Write `manifest` as indented JSON with sorted keys. It must have the key `whitefurnace` (the version)
-    and hold finite numbers only. Raises `FileError` for what cannot be written."""
+    """Write `manifest` as indented JSON with sorted keys.
+
+    manifest: must have the key `whitefurnace` (the version) and hold finite numbers only. into: the transaction that
+    the file belongs to. Raises `FileError` where the file cannot be written, and ValueError for another manifest.
+    """
     if "whitefurnace" not in manifest:
         raise ValueError("a manifest must have the key 'whitefurnace', the version that wrote it")
     # Python's own indentation is written in Python, at a tenth of the speed.

@@ -1,9 +1,9 @@
-"""Who may overwrite an output, and what is done about a run that was killed while it wrote one.
+"""Decides who may overwrite an output, and repairs what a run left that was killed while it wrote one.
 
-An output is a manifest and the files beside it that the manifest proves ours by their sha256. One writer at a time
-holds its lock. A `Transaction` renames the files first and the manifest last; a run that was killed between two renames
-leaves the manifest staged, which tells the next run whose the files are. Bakes and tables differ only in the form of
-their manifests: `FolderOutput` and `FileOutput`.
+An output is a manifest and the files next to it that the manifest proves to be ours by their sha256. One process at a
+time holds the lock of an output. A `Transaction` renames the files first and the manifest last. A run that was killed
+between two renames leaves the manifest staged, which tells the next run that the renamed files are ours. Bakes and
+tables differ only in the form of their manifests: `FolderOutput` and `FileOutput`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from whitefurnace.files.manifest import read_manifest
 
 @contextlib.contextmanager
 def system_errors(path: Path) -> Iterator[None]:
-    """Raise a FileError for what the system says of a file in passing, `path` where it names none."""
+    """Turn every OSError of the block into a FileError, which names `path` where the error names no file."""
     try:
         yield
     except OSError as error:
@@ -31,9 +31,9 @@ def system_errors(path: Path) -> Iterator[None]:
 
 
 class Output(ABC):
-    """The files that one manifest proves ours.
+    """The files that one manifest proves to be ours.
 
-    path: of the manifest, `NAME.json`. Files are named by their paths relative to its folder.
+    path: the manifest, `NAME.json`. All files are named by their paths relative to its folder.
     """
 
     writer: ClassVar[str]
@@ -48,24 +48,26 @@ class Output(ABC):
 
     @abstractmethod
     def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
-        """sha256 of each file that a manifest proves whole; None where it is no manifest of this form."""
+        """Return the sha256 of each file that a manifest lists as complete; None where it is no manifest of this
+        form.
+        """
 
     def kept(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
-        """sha256 of each file of earlier writers that a manifest still proves ours."""
+        """Return the sha256 of each file of earlier runs that a manifest still proves to be ours."""
         return {}
 
     def stale(self, there: dict[str, Any] | None, written: Iterable[str]) -> list[Path]:
-        """Files that the manifest `there` proves ours and that the files `written` make useless."""
+        """List the files that the manifest `there` proves to be ours and that the files `written` make useless."""
         return []
 
     # ------------------------------------------------------------------------------------------ manifests
 
     def manifest(self) -> dict[str, Any] | None:
-        """The manifest, or None where there is none that could prove anything. Raises FileError."""
+        """Return the manifest, or None where there is none that proves anything. Raises FileError."""
         return self._manifest(self.path)
 
     def staged(self) -> dict[str, Any] | None:
-        """The manifest that a run that was killed left staged, or None. Raises FileError."""
+        """Return the manifest that a killed run left staged, or None. Raises FileError."""
         return self._manifest(Transaction.staging(self.path))
 
     def _manifest(self, path: Path) -> dict[str, Any] | None:
@@ -73,7 +75,7 @@ class Output(ABC):
         return found if found and found.get("name") == self.name and self.digests(found) is not None else None
 
     def is_whole(self, manifest: Mapping[str, Any]) -> bool:
-        """Whether every file is there with the bytes that the manifest states. Raises FileError."""
+        """Return whether every file exists with the bytes whose digest the manifest states. Raises FileError."""
         return all(self._has(self.folder / name, [digest]) for name, digest in (self.digests(manifest) or {}).items())
 
     def _has(self, file: Path, digests: Iterable[Any]) -> bool:
@@ -90,10 +92,10 @@ class Output(ABC):
     # ------------------------------------------------------------------------------------------ ownership
 
     def check(self, files: Sequence[Path], there: dict[str, Any] | None, force: bool) -> None:
-        """Refuse to overwrite files, or the manifest, that are not ours.
+        """Refuse to overwrite files, or a manifest, that are not ours.
 
-        files: what is to be written. there: the manifest that is there. force: whether the user allows it.
-        Raises FileError.
+        files: the files that will be written. there: the existing manifest, or None. force: True if the user allows it.
+        Raises FileError, which names the file.
         """
         if force:
             return
@@ -114,9 +116,10 @@ class Output(ABC):
     # ------------------------------------------------------------------------------------------ recovery
 
     def settle(self, lock: Lock) -> dict[str, Any] | None:
-        """Complete or remove what a run that was killed left, and return the manifest that is there then.
+        """Complete or remove what a killed run left, and return the manifest that exists then.
 
-        What was staged is completed where all of it is there and no foreign file would be replaced. Raises FileError.
+        Staged files are renamed to their targets if all of them exist and no foreign file would be replaced; otherwise
+        they are removed. Raises FileError.
         """
         there, staged = self.manifest(), self.staged()
         if staged and (there or not os.path.lexists(self.path)):
@@ -153,7 +156,7 @@ class Output(ABC):
         return renames
 
     def tidy(self) -> None:
-        """Complete or remove what a run that was killed left, unless another run holds the lock. Raises FileError."""
+        """Complete or remove what a killed run left, unless another run holds the lock. Raises FileError."""
         path = lock_path(self.path)
         if path.exists() and (lock := acquire(path, wait=False)):
             try:
@@ -163,7 +166,7 @@ class Output(ABC):
 
 
 class FileOutput(Output):
-    """A table: FILE, and its manifest FILE.json with the sha256 of FILE."""
+    """The output of a table: FILE, and its manifest FILE.json with the sha256 of FILE."""
 
     writer = "this command"
 
@@ -178,9 +181,9 @@ class FileOutput(Output):
 
 
 class FolderOutput(Output):
-    """A bake: `ENGINE/STEM…` for several engines, and one manifest STEM.json that lists them.
+    """The output of a bake: `ENGINE/STEM…` for several engines, and one manifest STEM.json that lists the files.
 
-    `files` of the manifest are what its bake wrote, `kept` what earlier bakes wrote for other engines.
+    In the manifest, `files` lists what its bake wrote, and `kept` what earlier bakes wrote for other engines.
     """
 
     writer, makes_folder = "this bake", True
@@ -202,10 +205,10 @@ class FolderOutput(Output):
         return self.superseded(there, written)[0]
 
     def superseded(self, there: dict[str, Any] | None, written: Iterable[str]) -> tuple[list[Path], dict[str, Any]]:
-        """What the manifest `there` proves ours beside the files `written`.
+        """Return what the manifest `there` proves to be ours apart from the files `written`.
 
-        Returns stale files of the same engines (such as the last levels of a longer chain), and the manifest's entries
-        of files of other engines, which stay. Raises FileError.
+        The first value lists stale files of the same engines, such as the last levels of a longer chain. The second has
+        the manifest's entries for files of other engines, which stay. Raises FileError.
         """
         new = set(written)
         engines = {name.split("/")[0] for name in new}
@@ -222,9 +225,10 @@ class FolderOutput(Output):
         return stale, kept
 
     def check_writable(self, folders: Iterable[Path]) -> None:
-        """Make folders and a file in each, so that what cannot be written is found before the work and not after it.
+        """Create the folders and a file in each, so that a folder that cannot be written is found before the work
+        begins.
 
-        The caller notes `probe` of the folder of the manifest in the lock. Raises FileError.
+        The caller first notes `probe` of the manifest's folder in the lock. Raises FileError.
         """
         for folder in folders:
             try:
@@ -240,5 +244,7 @@ class FolderOutput(Output):
                 raise FileError(f"cannot write into {folder}: {error.strerror or error}") from error
 
     def probe(self, folder: Path) -> Path:
-        """The file that `check_writable` stages in a folder; no two outputs of a folder have a name in common."""
+        """Return the file that `check_writable` stages in a folder. Its name differs between the outputs of one
+        folder.
+        """
         return folder / f"{self.name}.probe"

@@ -60,7 +60,10 @@ FORMATS: Mapping[str, str] = {"float32": "rgba32f", "float16": "rgba16f", "r11g1
 
 
 def stored(values: np.ndarray, format: str) -> np.ndarray:
-    """Radiance (…, 3) after a round trip through a format of FORMATS, float64. Raises UsageError with the nearest name."""
+    """Return radiance (…, 3) after a round trip through the pixel format `format`, one of FORMATS, float64.
+
+    Raises UsageError with the nearest name.
+    """
     if format not in FORMATS:
         raise UsageError(f"unknown format {format!r}{nearest(format, FORMATS)}")
     values = np.asarray(values, np.float64)

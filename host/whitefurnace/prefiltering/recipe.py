@@ -80,7 +80,10 @@ def roughness_of_lod(lod: float, levels: int) -> float:
 
 
 def lod_of_roughness(roughness: float, levels: int) -> float:
-    """The lod at which engines read a perceptual roughness, the inverse of `roughness_of_lod`: (levels - 1) r (2 - r)."""
+    """Return the lod at which engines read a perceptual roughness: (levels - 1) r (2 - r).
+
+    This is the inverse of `roughness_of_lod`.
+    """
     return (levels - 1) * roughness * (2 - roughness)
 
 

@@ -113,7 +113,10 @@ def stored_directions(engine: Engine, d: np.ndarray) -> np.ndarray:
 
 
 def level(texels: np.ndarray, d: np.ndarray, border: int = 1) -> np.ndarray:
-    """A level read bilinearly in stored directions d (3, m): (m, 3). texels: a cube (6, s, s, 3), or an octahedral map."""
+    """Read a level bilinearly in stored directions d (3, m): (m, 3).
+
+    texels: a cube (6, s, s, 3), or an octahedral map (s, s, 3) with `border` texels around it.
+    """
     return bilinear(texels, d) if texels.ndim == 4 else octamap.read_bilinear(texels.astype(np.float64), d, border)
 
 
@@ -129,7 +132,10 @@ def trilinear(levels: Sequence[np.ndarray], d: np.ndarray, lod: np.ndarray, bord
 
 
 def specular(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Prefiltered radiance (m, 3) as the engine reads it for normals n, views v and perceptual roughness values (m,)."""
+    """Return prefiltered radiance (m, 3) as the engine reads it.
+
+    n, v: unit normals and view directions (3, m). roughness: perceptual roughness values (m,) in [0, 1].
+    """
     lod = lods(engine, roughness, len(lights.levels), lights.levels[0].shape[1])
     return trilinear(lights.levels, stored_directions(engine, looked_up(engine, n, v, roughness)), lod, lights.border)
 

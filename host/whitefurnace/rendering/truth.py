@@ -284,7 +284,10 @@ class Truth:
         return value if lights is None else value + self.gathered(found, points, lights), E
 
     def mirror(self, found: Term, points: Points) -> tuple[np.ndarray, np.ndarray]:
-        """As `reflected`, for a perfectly smooth surface: L(reflect(v)) F(n·v) [Hoffman2012, "Image Based Lighting"]."""
+        """Return what `reflected` returns, for a perfectly smooth surface: L(reflect(v)) F(n·v).
+
+        [Hoffman2012, "Image Based Lighting"]
+        """
         entry, m = found.models["fresnel"].model, points.n.shape[1]
         rows = [np.broadcast_to(found.parameters[f"fresnel_{p.name}"], (found.sets,)) for p in entry.parameters]
         cells = np.stack([np.tile(points.NoV, found.sets), *(np.repeat(row, m) for row in rows)])

@@ -223,7 +223,11 @@ def centred(size: Size) -> dict[str, Axis]:
 def usual_beside(
     usual: Mapping[str, Ends], given: Mapping[str, Any], fixed: Mapping[str, float], slot: str = "fresnel"
 ) -> dict[str, Any]:
-    """The axes of `usual` that are neither given nor fixed, by their name or as SLOT_NAME, before those that are given."""
+    """Return the given axes, after those of `usual` that are neither given nor fixed.
+
+    usual: default ranges of the parameters of `slot`. given: axes by name. fixed: parameters that stay at one number.
+    A parameter may be named by itself or as SLOT_NAME.
+    """
     taken = {*given, *fixed}
     return {**{name: ends for name, ends in usual.items() if not {name, f"{slot}_{name}"} & taken}, **given}
 

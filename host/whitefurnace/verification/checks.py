@@ -172,7 +172,10 @@ def verify(
 
 
 def _between(p: Parameter) -> np.ndarray:
-    """Typical values, the ends of the domain and what lies between: at the geometric mean where values are far apart."""
+    """Return the typical values of a parameter, the ends of its domain, and a value between each two neighbours.
+
+    It is the geometric mean where the neighbours are far apart, otherwise the middle.
+    """
     known = sorted({*p.typical, p.low, p.high})
     middles = [math.sqrt(a * b) if a > 0 and b > 2 * a else (a + b) / 2 for a, b in pairwise(known)]
     return np.array(sorted({*known, *middles}))
