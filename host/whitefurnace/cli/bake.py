@@ -139,6 +139,7 @@ OUTPUT, ACCURACY, ENVIRONMENT, LIGHT = "Output", "Accuracy", "Environment", "Sun
     "none, or sinc⁴ with its cutoff at degree X, 1 to 1024.",
 )
 @options.device()
+@options.memory()
 @options.dry_run()
 @options.force()
 @options.as_json()

@@ -100,6 +100,7 @@ OUTPUT, WORK = "Output", "Division of the work"
     help="Allow the job to name .clh files. Their code runs on the device.",
 )
 @options.device()
+@options.memory()
 @options.dry_run()
 @options.force()
 @options.as_json()

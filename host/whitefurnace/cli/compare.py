@@ -53,6 +53,7 @@ def axes(letter: str, default: str) -> options.Decorator:
 )
 @axes("A", "[default: those of the engine that it was written for, else +x +y +z]")
 @axes("B", "[default: as for A]")
+@options.memory()
 @options.as_json()
 def compare(
     a: Path,

@@ -27,6 +27,7 @@ Exit codes: 0 done, 1 usage, 2 cannot read, 3 invalid input (truncated and corru
 
 @options.command("Look and compare", "Show what a texture, table or image contains", EPILOG)
 @click.argument("file", type=options.FilePath)
+@options.memory()
 @options.as_json()
 def inspect(file: Path, as_json: bool) -> None:
     """Show what a texture, table or image contains: levels with their ranges, key-values, the engine it looks like, and

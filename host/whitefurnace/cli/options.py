@@ -6,6 +6,7 @@ quick.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -197,6 +198,30 @@ def device(heading: str = RUNNING) -> Decorator:
         help="OpenCL device: its number or a part of its name as `whitefurnace devices` lists them. "
         "[default: $WHITEFURNACE_DEVICE, else the best that works]",
     )
+
+
+def memory(heading: str = RUNNING) -> Decorator:
+    return option(
+        "--memory",
+        metavar="SIZE",
+        expose_value=False,
+        callback=_set_memory,
+        heading=heading,
+        help="Memory that reading one file may take, as 4GB or 25%. [default: $WHITEFURNACE_MEMORY, else 512 MiB and "
+        "1024 bytes for each byte of the file, but at most half of the machine's memory]",
+    )
+
+
+def _set_memory(context: click.Context, parameter: click.Parameter, value: str | None) -> None:
+    """Set `WHITEFURNACE_MEMORY` while the command runs, so that processes which it starts have the same limit."""
+    if value is None:
+        return
+    from whitefurnace.files.memory import VARIABLE, amount  # loads numpy
+
+    amount(value, "--memory")
+    before = os.environ.get(VARIABLE)
+    os.environ[VARIABLE] = value
+    context.call_on_close(lambda: os.environ.pop(VARIABLE) if before is None else os.environ.update({VARIABLE: before}))
 
 
 def dry_run(help: str = "Print what would be computed and written, and do nothing.") -> Decorator:

@@ -150,6 +150,7 @@ OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Truth beside the engine's picture
 )
 @options.light("Further light beside the environment (may be repeated)", multiple=True, heading=TRUTH)
 @options.device(TRUTH)
+@options.memory()
 @options.force("Overwrite FILE if it exists.")
 @options.as_json()
 def render(

@@ -106,6 +106,7 @@ OUTPUT, SCENE, MEDIA = "Output", "Scene and lighting", "Media inside objects"
     "to 1. Needs --environment."
 )
 @options.device()
+@options.memory()
 @options.force()
 @options.as_json()
 @options.quiet()

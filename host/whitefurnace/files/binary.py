@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from whitefurnace.errors import FileError, InputError
+from whitefurnace.files import memory
 
 Buffer = bytes | memoryview
 
@@ -64,6 +65,7 @@ def load(path: str | os.PathLike[str]) -> Source:
             raise FileError(f"cannot read {path}: it is not a regular file")
         if not 0 < status.st_size <= MAX_BYTES:
             raise InputError(f"{path} has {status.st_size} bytes, a texture has 1 to {MAX_BYTES}")
+        memory.require(status.st_size, "its bytes", path, status.st_size)
         with open(path, "rb") as file:
             return Source(file.read(status.st_size), str(path))
     except OSError as error:

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import FileError, InputError
+from whitefurnace.files import memory
 from whitefurnace.files.atomic import digest_file
 from whitefurnace.files.integrity import check_file
 
@@ -238,12 +239,20 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
     first, last = min(picks), max(picks) + 1
     columns = slice(spec.full_x - spec.x, spec.full_x - spec.x + spec.full_width)
     begin, end = spec.full_y, spec.full_y + spec.full_height
-    out = np.empty((end - begin, spec.full_width, len(picks)), np.float32)
     kind = pixel if pixel in ("uint8", "uint16") else "float"
     tile = spec.tile_height if spec.tile_width else 0
     # Bands are whole compressed blocks; the largest of EXR has 256 rows (DWAB). Tiles have their own height.
     unit = tile or max(1, min(int(spec.get_int_attribute("oiio:RowsPerChunk", 1)), 256))
-    rows = unit * max(1, _CHUNK_BYTES // (spec.width * (last - first) * 4 * unit))
+    row = spec.width * (last - first) * 4
+    rows = unit * max(1, _CHUNK_BYTES // (row * unit))
+    texels = (end - begin) * spec.full_width
+    # A band is there twice: as OpenImageIO's bytes and as the array that it is returned in.
+    memory.require(
+        4 * texels * len(picks) + 2 * row * min(rows, spec.height),
+        f"its {spec.full_width} x {end - begin} pixels of {len(picks)} channels",
+        path,
+    )
+    out = np.empty((end - begin, spec.full_width, len(picks)), np.float32)
     order = [pick - first for pick in picks]
     straight = order == list(range(last - first))
     # Bands start at whole blocks of the data window, which may begin above the display window.
