@@ -115,13 +115,15 @@ def pairs(
 ) -> tuple[list[np.ndarray], dict[str, np.ndarray], np.ndarray]:
     """(NoV, NoL, NoH, VoH, at_v, at_l), the model's parameters, and the α that made at_v and at_l."""
     own = parameters(entry) or [np.array([1e-4, 0.03, 0.3, 1.0])]
-    NoV, NoL, phi, alpha = product(np.append(0.0, COSINES), lights, AZIMUTHS, own[0])
+    NoV, NoL, phi, *numbers = product(np.append(0.0, COSINES), lights, AZIMUTHS, *own)
+    alpha = numbers[0]
     to_l, to_v = directions(NoL, NoV, phi)
     length = np.linalg.norm(to_l + to_v, axis=-1)
     keep = length > 1e-6  # l = -v has no half vector
     rows = [NoV, NoL, (NoL + NoV) / np.maximum(length, 1e-300), length / 2, ggx_area(NoV, alpha), ggx_area(NoL, alpha)]
     rows = [rounded(row[keep], precision) for row in rows]
-    return rows, inside(entry, [alpha[keep]] * len(entry.parameters), precision), alpha[keep]
+    given = [column[keep] for column in numbers][: len(entry.parameters)]
+    return rows, inside(entry, given, precision), alpha[keep]
 
 
 def masked(
@@ -148,9 +150,10 @@ def test_masking_is_its_reference(entry: Model, device: Device, precision: int, 
     rows, own, alpha = pairs(entry, precision)
     names = dict(zip(("NoV", "NoL", "NoH", "VoH", "at_v", "at_l"), rows, strict=True), **own)
     # A handful of multiplications and one division, each half an ulp, a difference that does not cancel. Cook and
-    # Torrance's reference takes (n·h) from the cosines, and (v·h) twice, which their own rounding tells apart.
-    allowed = 6 * EPS[precision]
+    # Torrance's reference takes (n·h) from the cosines, and (v·h) twice, which their own rounding tells apart. An entry
+    # whose kernel has costlier functions states its own error.
     for function, name in (("MASKING_V", "V"), ("MASKING_G", "G")):
+        allowed = entry.checks.tolerance.get(f"kernel {name}", (6 * EPS[32], 6 * EPS[64]))[precision == 64]
         got = masked(device, entry, function, rows, own, alpha, precision, lanes)
         want = entry.reference[name](*rows, **own)
         known = np.isfinite(want)
@@ -185,13 +188,20 @@ def test_light_from_below_is_masked(entry: Model, device: Device, precision: int
 @every("masking")
 @PRECISIONS
 def test_masking_is_as_reciprocal_as_it_says(entry: Model, device: Device, precision: int) -> None:
-    assert entry.checks.reciprocal is True
     rows, own, alpha = pairs(entry, precision)
     lit = rows[0] > 0  # n·v = 0 would become a light that is hidden
     rows, own, alpha = [row[lit] for row in rows], {name: v[lit] for name, v in own.items()}, alpha[lit]
     back = [rows[1], rows[0], rows[2], rows[3], rows[5], rows[4]]
     there, again = (masked(device, entry, "MASKING_G", r, own, alpha, precision, None) for r in (rows, back))
-    check(there, again, 6 * EPS[precision], NoV=rows[0], NoL=rows[1], **own)
+    if entry.checks.reciprocal:
+        same = np.ones(len(there), bool)
+    else:
+        assert entry.checks.reciprocal is False and entry.checks.reciprocal_at
+        same = np.all([own[name] == value for name, value in entry.checks.reciprocal_at.items()], axis=0)
+        assert np.abs(there - again)[~same].max() > 1e-3
+    assert same.any()
+    where = {"NoV": rows[0], "NoL": rows[1], **own}
+    check(there[same], again[same], 6 * EPS[precision], **{name: v[same] for name, v in where.items()})
 
 
 @pytest.mark.parametrize(
@@ -205,6 +215,44 @@ def test_masking_of_one_direction(entry: Model, device: Device, precision: int) 
     check(G1, entry.reference["G1"](rows[0], rows[4], **own), 4 * EPS[precision], NoV=rows[0], **own)
     G = masked(device, entry, "MASKING_G", rows, own, alpha, precision, None)
     check(G, G1, 6 * EPS[precision], NoV=rows[0], **own)
+
+
+@pytest.mark.parametrize(("NoV", "NoL"), [(1e-4, 0.3), (0.1, 0.1), (0.3, 0.49), (0.51, 0.02), (0.7, 0.999), (1.0, 1.0)])
+def test_masking_of_sheen_in_more_digits(NoV: float, NoL: float) -> None:
+    """Both formulas as the papers print them, the 4 of f = D F V/4 apart, in 40 digits."""
+    given = {"NoV": NoV, "NoL": NoL, "NoH": 0.5, "VoH": 0.5, "at_v": 0.0, "at_l": 0.0}
+    with mpmath.workdps(40):
+        v, light = mpmath.mpf(NoV), mpmath.mpf(NoL)
+        neubelt = 4 / (4 * (light + v - light * v))
+        assert float(models("masking")["ashikhmin"].reference["V"](**given)) == pytest.approx(float(neubelt), rel=1e-14)
+        for alpha, softening in ((0.0, 0.0), (0.04, 0.0), (0.3, 1.0), (1.0, 0.5)):
+            # p(r) = (1 - r)² p₀ + (1 - (1 - r)²) p₁ with the table of the paper.
+            share = (1 - mpmath.mpf(alpha)) ** 2
+            a, b, c, d, e = (
+                share * mpmath.mpf(smooth) + (1 - share) * mpmath.mpf(rough)
+                for smooth, rough in (
+                    ("25.3245", "21.5473"),
+                    ("3.32435", "3.82987"),
+                    ("0.16801", "0.19823"),
+                    ("-1.27393", "-1.97760"),
+                    ("-4.85967", "-4.32054"),
+                )
+            )
+
+            def fit(x, a=a, b=b, c=c, d=d, e=e):
+                return a / (1 + b * x**c) + d * x + e
+
+            def lam(x, fit=fit):
+                half = mpmath.mpf(1) / 2
+                return mpmath.exp(fit(x)) if x < half else mpmath.exp(2 * fit(half) - fit(1 - x))
+
+            soft = lam(light) ** (1 + 2 * mpmath.mpf(softening) * (1 - light) ** 8)
+            want = 1 / (1 + lam(v) + soft)
+            own = {"alpha": alpha, "softening": softening}
+            entry = models("masking")["estevez_kulla"]
+            # exp of logs up to 20 in float64.
+            assert float(entry.reference["G"](**given, **own)) == pytest.approx(float(want), rel=1e-13), own
+            assert float(entry.reference["V"](**given, **own)) == pytest.approx(float(want / v / light), rel=1e-13), own
 
 
 def test_schlick_is_as_far_from_smith_as_its_entry_says() -> None:

@@ -1,7 +1,8 @@
 """The bibliography: every paper that kernels, catalogue entries and the engine cite, by key.
 
 An entry of the catalogue brings the paper that it is from (`citation=Paper(…)`). Papers that belong to no single entry,
-since several cite them or the engine does, are listed here; an entry takes one of these with `cited`.
+since the engine or several of them cite them, are listed here; an entry takes one of these with `cited`. It takes a
+paper that another entry brings from that entry (`citation=CHARLIE.citation`).
 """
 
 from __future__ import annotations

@@ -59,7 +59,8 @@ class Checks:
     """What an entry states for the engine and the tests to act on. None means that nothing is stated.
 
     normalized: whether ∫ D(m)(n·m) dω is 1.
-    reciprocal: whether the model stays the same when l and v are exchanged.
+    reciprocal: whether the model stays the same when l and v are exchanged. `reciprocal_at` has the parameter values
+      with which it does where it does not otherwise.
     slow_rules: by how many times its change from the rule before a quadrature rule may err; over 1 where the integrand
       has kinks or roots that rules resolve slowly.
     weak_furnace: value of the weak furnace test with every NDF, for a masking.
@@ -72,6 +73,7 @@ class Checks:
 
     normalized: bool | None = None
     reciprocal: bool | None = None
+    reciprocal_at: Mapping[str, float] = field(default_factory=dict)
     slow_rules: float | None = None
     weak_furnace: float | None = None
     tolerance: Mapping[str, tuple[float, float]] = field(default_factory=dict)
@@ -84,6 +86,7 @@ class Checks:
 _LISTED = {
     "normalized": (),
     "reciprocal": (),
+    "reciprocal at": (),
     "slow rules": ("float32", "follows roughness"),
     "weak furnace": ("follows roughness",),
     "tolerance": ("float32", "energy"),
