@@ -55,9 +55,11 @@ class Expression:
         try:
             self._tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError):
-            raise UsageError(f"{where}: {text!r} is not a formula") from None
+            raise UsageError(f"{where}: {text!r} is not a formula of {', '.join(names)}") from None
         if sum(1 for _ in ast.walk(self._tree)) > MOST_NODES:
-            raise UsageError(f"{where}: {text[:40]!r}… has more than {MOST_NODES} parts")
+            raise UsageError(
+                f"{where}: {text[:40]!r}… is too long: a formula has at most {MOST_NODES} numbers, names and operators"
+            )
         self._check(self._tree)
 
     def __repr__(self) -> str:
@@ -103,7 +105,7 @@ class Expression:
             case ast.Name(id=name):
                 if name in self.names:
                     return
-                raise UsageError(f"{self.where}: {self.text!r} has {name!r}{nearest(name, self.names)}")
+                raise UsageError(f"{self.where}: {self.text!r} has an unknown name {name!r}{nearest(name, self.names)}")
             case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=operand):
                 return self._check(operand)
             case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY or isinstance(op, ast.Pow):
@@ -117,15 +119,19 @@ class Expression:
                 return
             case ast.Call(func=ast.Name(id=name), args=args, keywords=[]):
                 if name not in FUNCTIONS:
-                    raise UsageError(f"{self.where}: {self.text!r} has {name!r}{nearest(name, FUNCTIONS)}")
+                    raise UsageError(
+                        f"{self.where}: {self.text!r} has an unknown function {name!r}{nearest(name, FUNCTIONS)}"
+                    )
                 if len(args) != FUNCTIONS[name][0]:
-                    raise UsageError(f"{self.where}: {name} takes {FUNCTIONS[name][0]} numbers, not {len(args)}")
+                    count = FUNCTIONS[name][0]
+                    many = "1 argument" if count == 1 else f"{count} arguments"
+                    raise UsageError(f"{self.where}: {name} takes {many}, and {self.text!r} gives it {len(args)}")
                 for part in args:
                     self._check(part)
                 return
         raise UsageError(
-            f"{self.where}: {self.text!r} is no formula of numbers, {', '.join(self.names)}, "
-            f"+ - * / ** and {', '.join(FUNCTIONS)}"
+            f"{self.where}: {self.text!r} is not a formula; it may use numbers, {', '.join(self.names)}, + - * / **, "
+            f"`a if x < y else b` and {', '.join(FUNCTIONS)}"
         )
 
     def _value(self, node: ast.AST, names: Mapping[str, Any]) -> Any:
@@ -204,10 +210,10 @@ def table_text(points: Sequence[Sequence[float]], name: str, where: str) -> str:
     """
     rows = [tuple(float(x) for x in point) for point in points]
     if len(rows) < 2 or any(len(row) != 2 or not all(map(math.isfinite, row)) for row in rows):
-        raise UsageError(f"{where}: a table has two or more pairs of finite numbers, as [[0, 0], [1, 4]]")
+        raise UsageError(f"{where}: two or more pairs of finite numbers were expected, such as [[0, 0], [1, 4]]")
     text = repr(rows[0][1])
     for (x0, y0), (x1, y1) in pairwise(rows):
         if x1 <= x0:
-            raise UsageError(f"{where}: {name} = {x1:g} follows {x0:g}; it must grow from pair to pair")
+            raise UsageError(f"{where}: {name} = {x1:g} follows {name} = {x0:g}; the values must grow")
         text += f" + ({y1 - y0!r}) * clamp(({name} - ({x0!r})) / ({x1 - x0!r}), 0, 1)"
     return text

@@ -217,7 +217,7 @@ def test_an_item_that_cannot_be_sent_fails_alone():
 
     found = collect([Job("a"), Local("b"), Job("c")], workers=2)
     assert (found["a"].state, found["c"].state) == ("done", "done")
-    assert found["b"].state == "failed" and found["b"].message.startswith("it cannot be sent: ")
+    assert found["b"].state == "failed" and found["b"].message.startswith("the item cannot be sent: ")
 
 
 def test_results_come_as_they_are_done(tmp_path):
@@ -376,7 +376,7 @@ def test_a_killed_worker_costs_its_items_one_retry_and_the_innocent_nothing(tmp_
     guilty = {"9", "12"}
     assert {name for name, result in found.items() if result.state == "failed"} == guilty
     for name in guilty:
-        assert found[name].message == "the worker that had it was killed (signal 9), twice"
+        assert found[name].message == "two processes ended while they worked on it; the second was killed (signal 9)"
     lines = (tmp_path / "computed").read_text().split("\n")[:-1]
     tries = {name: sum(line.split()[0] == name for line in lines) for name in (job.name for job in jobs)}
     # An item that waited for its computation in a worker that another item killed is computed in its second turn alone.
@@ -661,8 +661,8 @@ def test_a_lost_scheduler_is_a_clear_end(scheduler, tmp_path, count):
     killer.join()
     done = len(set(found))
     assert str(caught.value) == (
-        f"the scheduler at {address} is gone: {done} item{' was' if done == 1 else 's were'} "
-        "done before; run it again to go on with the rest"
+        f"the scheduler at {address} was lost after {done} item{' was' if done == 1 else 's were'} "
+        "done; run the batch again to continue"
     )
     assert done < count
 
@@ -682,7 +682,9 @@ def test_without_dask_one_sentence_names_the_extra(monkeypatch):
 
 def test_a_worker_with_another_version_is_refused(cluster, monkeypatch):
     monkeypatch.setattr(pool, "VERSION", "9.9")
-    with pytest.raises(UnsupportedError, match=r"has whitefurnace .*, this is 9\.9: install the same on both"):
+    with pytest.raises(
+        UnsupportedError, match=r"has whitefurnace .* and this machine 9\.9: install one version on both"
+    ):
         pool.run(STAGES, [Job("a")], scheduler=cluster, on_result=print)
     # One that joins later is refused by the task itself.
     assert pool._do(STAGES, Job("a"), "8.8").message == "its worker has whitefurnace 9.9, the batch 8.8"
@@ -692,7 +694,7 @@ def test_a_worker_with_another_version_is_refused(cluster, monkeypatch):
     "address, error, told",
     [
         ("tcp://127.0.0.1:1", FileError, "no scheduler answers at tcp://127.0.0.1:1"),
-        ("nowhere://127.0.0.1:8786", UsageError, "is no address of a scheduler"),
+        ("nowhere://127.0.0.1:8786", UsageError, "is not the address of a scheduler"),
     ],
 )
 def test_an_address_where_nobody_answers_is_told(address, error, told, monkeypatch):

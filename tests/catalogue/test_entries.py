@@ -15,7 +15,9 @@ import pytest
 import whitefurnace
 from whitefurnace.catalogue import SLOTS, Model, models
 from whitefurnace.catalogue.bibliography import SHARED, bibliography, cited
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.catalogue.model import Checks, Paper
+from whitefurnace.errors import UsageError
 from whitefurnace.opencl.device import Device
 
 HOST = Path(whitefurnace.__file__).parent
@@ -31,6 +33,15 @@ def test_an_entry_has_one_paper_and_its_kernel_cites_known_ones(entry: Model) ->
     assert known[entry.citation.key] == entry.citation and entry.citation.text
     for key in KEY.findall((KERNELS / entry.kernel_file).read_text("utf-8")):
         assert key in known, f"{entry.kernel_file} cites {key}: add it to the entry's also_cited"
+
+
+@EVERY
+def test_an_entry_is_refused_in_another_slot(entry: Model) -> None:
+    """A program binds a model by its slot, so an entry of another slot must not get as far as a kernel."""
+    for slot in {*SLOTS, "brdf"} - {entry.slot}:
+        with pytest.raises(UsageError, match=rf"^{slot} is {entry.name}, which is a model of the slot {entry.slot}$"):
+            chosen(slot, entry)
+    assert chosen(entry.slot, entry).model is entry
 
 
 def test_a_paper_is_listed_once() -> None:

@@ -248,7 +248,7 @@ def test_levels_go_by_size_and_by_roughness_where_both_know_it(tmp_path):
     ]
     assert found.notices == ("level 1 (4²) of a.npz: no counterpart",)
     c = raw(tmp_path / "c.npz", [levels[1]], roughness=[0.3])
-    with pytest.raises(UnsupportedError, match=r"no level of one roughness"):
+    with pytest.raises(UnsupportedError, match=r"no level of the same roughness"):
         compare(contents(c), contents(raw(tmp_path / "d.npz", [levels[0]], roughness=[0.7])))
     assert [row.part for row in compare(contents(c), contents(raw(tmp_path / "e.npz", chain()))).rows] == ["level 2"]
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any
 
 from whitefurnace.advice.choose import TOLERANCE_RANGE, Choice, choose
 from whitefurnace.advice.measure import Budget, Entry, ErrorMeter
@@ -18,10 +17,17 @@ from whitefurnace.scenes.materials import Scene
 from whitefurnace.sphere.environments import Environment, environment
 
 
-def usual(engine: Engine, **options: Any) -> Chain:
-    """The chain that is baked for an engine by default, with `options` of `chain` changed."""
-    given = {"size": engine.size, **({"levels": engine.levels} if engine.levels else {}), **options}
-    return chain(lods=engine.lods, usual_min=engine.min_size, **given)
+def usual(engine: Engine, *, size: int | None = None) -> Chain:
+    """Return the chain that is baked for an engine by default.
+
+    size: texels a face edge of level 0, a power of two; None for the engine's own. Raises UsageError for another size.
+    """
+    return chain(
+        size=engine.size if size is None else size,
+        levels=engine.levels or None,
+        lods=engine.lods,
+        usual_min=engine.min_size,
+    )
 
 
 def measure(scene: Scene, env: Environment, engine: Engine, recipe: Chain | None, device: Device) -> Budget:

@@ -91,9 +91,9 @@ def run(
     An exception of `items` is raised after the items in flight have ended.
     """
     if not 1 <= workers <= MOST_WORKERS:
-        raise UsageError(f"{workers} workers: give 1 to {MOST_WORKERS}")
+        raise UsageError(f"the number of workers is {workers}, outside [1, {MOST_WORKERS}]")
     if scheduler is not None and workers != 1:
-        raise UsageError("workers and a scheduler: a cluster has its own workers; give one of the two")
+        raise UsageError("give a number of workers or a scheduler, not both: a cluster has its own workers")
     report = on_notice or (lambda text: None)
     with _Interrupts(stop or threading.Event(), report) as interrupts:
         if scheduler is not None:
@@ -495,7 +495,7 @@ class _Crew:
                 blob = pickle.dumps((ticket, pickle.dumps(item)))
             except Exception as error:
                 worker.alone = False
-                self._result(self.stages.failed(item, f"it cannot be sent: {_message(error)}", _code(error)))
+                self._result(self.stages.failed(item, f"the item cannot be sent: {_message(error)}", _code(error)))
                 continue
             worker.items[ticket] = item
             worker.wants = False
@@ -543,11 +543,13 @@ class _Crew:
         worker.connection.close()
         self.stillborn = 0 if worker.heard else self.stillborn + 1
         if self.stillborn > 2:
-            raise DeviceError(f"worker processes end before they begin: the last {cause}")
+            raise DeviceError(f"worker processes cannot start: the last one {cause} before it was ready")
         if not self.interrupts.stop.is_set():
             for ticket, item in worker.items.items():
                 if worker.alone:
-                    self._result(self.stages.failed(item, f"the worker that had it {cause}, twice", 2))
+                    self._result(
+                        self.stages.failed(item, f"two processes ended while they worked on it; the second {cause}", 2)
+                    )
                 else:
                     self.again.append((ticket, item))
             if not worker.alone:
@@ -695,7 +697,9 @@ def _on_cluster(
         except (OSError, TimeoutError) as error:
             raise FileError(f"no scheduler answers at {address}") from error
         except (ValueError, TypeError) as error:
-            raise UsageError(f"{address!r} is no address of a scheduler: {error}; e.g. tcp://host:8786") from error
+            raise UsageError(
+                f"{address!r} is not the address of a scheduler, such as tcp://host:8786: {error}"
+            ) from error
         cluster = _Cluster(stages, items, address, client, on_result, report, interrupts)
         try:
             cluster.run()
@@ -763,9 +767,7 @@ class _Cluster:
     def _gone(self) -> FileError:
         """Return the error for a lost scheduler."""
         done = "1 item was" if self.done == 1 else f"{self.done} items were"
-        return FileError(
-            f"the scheduler at {self.address} is gone: {done} done before; run it again to go on with the rest"
-        )
+        return FileError(f"the scheduler at {self.address} was lost after {done} done; run the batch again to continue")
 
     def _look(self) -> None:
         """Every two seconds, look which workers there are, and limit new ones to their share of the cores."""
@@ -799,7 +801,8 @@ class _Cluster:
                     )
                 if isinstance(version, str) and version != VERSION:
                     raise UnsupportedError(
-                        f"the worker {name} has whitefurnace {version}, this is {VERSION}: install the same on both"
+                        f"the worker {name} has whitefurnace {version} and this machine {VERSION}: "
+                        "install one version on both"
                     )
             self.settled.update(fresh)
         self.window = WINDOW * len(able)
@@ -812,7 +815,7 @@ class _Cluster:
         except Exception as error:
             if self.client.status != "running":
                 raise self._gone() from error
-            self._result(self.stages.failed(item, f"it cannot be sent: {_message(error)}", _code(error)))
+            self._result(self.stages.failed(item, f"the item cannot be sent: {_message(error)}", _code(error)))
             return
         self.flying[future] = item
         future.add_done_callback(self.landed.put)

@@ -20,7 +20,7 @@ from whitefurnace.prefiltering import plan as planning
 from whitefurnace.prefiltering.convolution import Convolver
 from whitefurnace.prefiltering.jobs import chain_jobs
 from whitefurnace.prefiltering.means import Means
-from whitefurnace.prefiltering.recipe import QUALITIES, Chain, chain
+from whitefurnace.prefiltering.recipe import CERTIFIED, QUALITIES, Chain, chain
 from whitefurnace.sphere.environments import Environment, environment
 from whitefurnace.sphere.grids import Shape
 
@@ -136,9 +136,20 @@ def _repeated(measure: Callable[[], Any], runs: int, budget: float) -> list[Any]
     return found
 
 
-def _prefilter(env: Environment, device: Device, **options: Any) -> tuple[lighting.Prefiltered, float, float]:
-    """(chain, seconds from texels to levels, seconds of the certificate)."""
-    made = lighting.prefilter(env, device=device, **options)
+def _prefilter(
+    env: Environment,
+    device: Device,
+    size: int,
+    min_size: int,
+    *,
+    tolerance: float | None = None,
+    samples: int | None = None,
+    certify: int = CERTIFIED,
+) -> tuple[lighting.Prefiltered, float, float]:
+    """Return (chain, seconds from texels to levels, seconds of the certificate)."""
+    made = lighting.prefilter(
+        env, size=size, min_size=min_size, tolerance=tolerance, samples=samples, certify=certify, device=device
+    )
     return made, made.timings["source"] + made.timings["levels"], made.timings["certificate"]
 
 
@@ -167,10 +178,18 @@ def points(
     for k, (method, setting) in enumerate(todo):
         if progress:
             progress(f"{method} {setting:g}", k / len(todo))
-        value = int(setting) if method == "samples" else setting
-        options: dict[str, Any] = {method: value, "size": size, "min_size": min_size}
+        sampled = method == "samples"
+        chosen = partial(
+            _prefilter,
+            env,
+            device,
+            size,
+            min_size,
+            tolerance=None if sampled else setting,
+            samples=int(setting) if sampled else None,
+        )
         try:
-            found = _repeated(partial(_prefilter, env, device, **options), runs, budget)
+            found = _repeated(chosen, runs, budget)
         except CheckError as error:
             yield Missed(env.name, method, setting, str(error))
             continue
@@ -239,7 +258,7 @@ def costs(
     """Measure the seconds of a chain over output sizes and source rows, and of a level over α, at COST_TOLERANCE."""
 
     def whole(some: Environment, size: int) -> float:
-        return _prefilter(some, device, tolerance=COST_TOLERANCE, size=size, min_size=min(min_size, size), certify=0)[1]
+        return _prefilter(some, device, size, min(min_size, size), tolerance=COST_TOLERANCE, certify=0)[1]
 
     def measures() -> Iterator[tuple[str, float, Callable[[], float]]]:
         for n in sizes:

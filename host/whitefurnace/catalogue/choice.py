@@ -44,12 +44,14 @@ def chosen(slot: str, spec: Spec) -> Chosen:
 
     slot: "ndf", "masking", "fresnel", "diffuse", "light" or "brdf". spec: `NAME`, `NAME:PRESET`, `NAME:p=v,…`,
     `FILE.clh[:p=v,…]`, a catalogue entry or a choice. A value is a number, or three for RGB (`f0=1/.71/.29`). Raises
-    UsageError with the nearest name, and what `user_model` raises for a file.
+    UsageError with the nearest name or for a model of another slot, and what `user_model` raises for a file.
     """
-    if isinstance(spec, Chosen):
-        return spec
     if isinstance(spec, Model):
-        return Chosen(spec, {})
+        spec = Chosen(spec, {})
+    if isinstance(spec, Chosen):
+        if spec.model.slot != slot:
+            raise UsageError(f"{slot} is {spec.model.name}, which is a model of the slot {spec.model.slot}")
+        return spec
     if not isinstance(spec, str | os.PathLike):
         raise UsageError(f"{slot} is {spec!r}; a name, a path or a catalogue entry was expected")
     spec = os.fspath(spec)

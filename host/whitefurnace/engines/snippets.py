@@ -49,7 +49,7 @@ class _Writer:
     def comment(self, text: str) -> None:
         self.lines.append(f"// {_line(text)}")
 
-    def resource(self, kind: str, name: str, told: str) -> None:
+    def resource(self, kind: str, name: str, remark: str) -> None:
         """A texture ("cube", "2d"), the sampler or nine vectors ("sh"), at the next binding of group 0."""
         glsl = {"cube": "uniform samplerCube {};", "2d": "uniform sampler2D {};", "sh": "uniform vec3 {}[9];"}
         hlsl = {
@@ -67,7 +67,7 @@ class _Writer:
         text = {"glsl": glsl, "hlsl": hlsl, "wgsl": wgsl}[self.language].get(kind)
         if text is not None:  # GLSL has the sampler in the texture
             place = f"@group(0) @binding({self.bound}) " if self.language == "wgsl" else ""
-            self.lines.append(f"{place}{text.format(name)}  // {_line(told)}")
+            self.lines.append(f"{place}{text.format(name)}  // {_line(remark)}")
             self.bound += 1
 
     def vector(self, *parts: str) -> str:
@@ -93,14 +93,14 @@ class _Writer:
         takes: Sequence[tuple[str, str]],
         first: Sequence[tuple[str, str, str]],
         value: str,
-        told: str = "",
+        remark: str = "",
     ) -> None:
         """`first` are (type, name, expression) that `value` may use."""
         if self.language == "wgsl":
             head = f"fn {name}({', '.join(f'{n}: {self.type[t]}' for t, n in takes)}) -> {self.type[result]} {{"
         else:
             head = f"{self.type[result]} {name}({', '.join(f'{self.type[t]} {n}' for t, n in takes)}) {{"
-        self.lines.append(head + (f"  // {told}" if told else ""))
+        self.lines.append(head + (f"  // {remark}" if remark else ""))
         for kind, variable, expression in first:
             declared = f"let {variable}" if self.language == "wgsl" else f"{self.type[kind]} {variable}"
             self.lines.append(f"    {declared} = {expression};")
@@ -163,8 +163,8 @@ def _resources(to: _Writer, engine: Engine, levels: int, width: int, stem: str) 
     specular = engine.holding("specular")[0]
     to.resource("sampler", "linear_clamp", "linear in all of min, mag and mip, clamped to the edge")
     codes = ", its texels through decode_rgbd" if specular.stored == "rgbd" else ""
-    told = f"{_name(specular, stem)}: {levels} levels from {width} x {width}{codes}"
-    to.resource(_kind(specular), "specular_map", told)
+    content = f"{_name(specular, stem)}: {levels} levels from {width} x {width}{codes}"
+    to.resource(_kind(specular), "specular_map", content)
     for file in engine.holding("sheen")[:1]:
         to.resource(_kind(file), "sheen_map", f"{_name(file, stem)}: the same for Charlie's lobe")
     if (rows := _rows(engine)) is not None:
@@ -310,7 +310,7 @@ def _least(engine: Engine) -> str:
 
 
 def _irradiance(to: _Writer, engine: Engine) -> None:
-    zero, told = to.vector("0.0", "0.0", "0.0"), "E/pi"
+    zero, meaning = to.vector("0.0", "0.0", "0.0"), "E/pi"
     first = [("vec3", "d", "stored_direction(n)")]
     if _rows(engine) is not None and engine.sh == "babylon":
         # What harmonic.babylon inverts: 3/2 and 4 undo the cosine kernel that Babylon.js divides out.
@@ -319,15 +319,15 @@ def _irradiance(to: _Writer, engine: Engine) -> None:
             "sh[3] * (4.0 * d.x * d.x - 1.0) + sh[4] * (4.0 * d.y * d.y - 1.0) + sh[5] * (4.0 * d.z * d.z - 1.0)",
             "4.0 * (sh[6] * d.y * d.z + sh[7] * d.z * d.x + sh[8] * d.x * d.y)",
         )
-        to.function("vec3", "irradiance", [("vec3", "n")], first, f"max({_sum(value)}, {zero})", told)
+        to.function("vec3", "irradiance", [("vec3", "n")], first, f"max({_sum(value)}, {zero})", meaning)
     elif _rows(engine) is not None and engine.sh is not None:
         factors = np.diag(harmonic.unscaled(np.eye(9), engine.sh)) * harmonic.COSINE * harmonic.FACTORS
         terms = [
-            f"sh[0] * {_number(factors[0])}",
+            f"sh[0] * {_literal(factors[0])}",
             *(f"sh[{k}] * {_times(float(factors[k]), MONOMIALS[k])}" for k in range(1, 9)),
         ]
         value = (" + ".join(terms[:4]), " + ".join(terms[4:7]), " + ".join(terms[7:]))
-        to.function("vec3", "irradiance", [("vec3", "n")], first, f"max({_sum(value)}, {zero})", told)
+        to.function("vec3", "irradiance", [("vec3", "n")], first, f"max({_sum(value)}, {zero})", meaning)
     else:
         cube = bool(engine.holding("irradiance"))
         file = engine.holding("irradiance" if cube else "specular")[0]
@@ -344,7 +344,7 @@ def _irradiance(to: _Writer, engine: Engine) -> None:
             [("vec3", "n")],
             [],
             read,
-            told if cube else f"{told}, for which the level of r = 1 stands",
+            meaning if cube else f"{meaning}, for which the level of r = 1 stands",
         )
 
 
@@ -354,10 +354,10 @@ def _sum(parts: Sequence[str]) -> str:
 
 def _times(factor: float, text: str) -> str:
     """factor · text, without a factor of 1; in nine digits, more than float32 has."""
-    return text if abs(factor - 1) < 1e-9 else f"({_number(factor)} * {text})"
+    return text if abs(factor - 1) < 1e-9 else f"({_literal(factor)} * {text})"
 
 
-def _number(value: float) -> str:
+def _literal(value: float) -> str:
     text = f"{value:.9g}"
     return text if "." in text or "e" in text else f"{text}.0"
 

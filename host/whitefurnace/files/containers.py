@@ -43,7 +43,7 @@ def parse_texture(source: Source) -> Texture:
     for magic, parse in _PARSERS.items():
         if head.startswith(magic):
             return parse(source)
-    raise InputError(f"{source.name} is not a texture in a container that is known: KTX 1, KTX 2 or DDS")
+    raise InputError(f"{source.name} is not a KTX 1, KTX 2 or DDS texture")
 
 
 def write_texture(
@@ -59,10 +59,10 @@ def write_texture(
     if suffix == ".ktx2":
         ktx2.write_ktx2(path, texture, zstd=zstd, into=into)
     elif suffix in (".ktx", ".dds") and zstd is not None:
-        raise UnsupportedError(f"{path}: Zstandard is for .ktx2, not for {suffix}")
+        raise UnsupportedError(f"{path}: only .ktx2 files can be compressed by Zstandard, not {suffix}")
     elif suffix == ".ktx":
         ktx1.write_ktx1(path, texture, into=into)
     elif suffix == ".dds":
         dds.write_dds(path, texture, into=into)
     else:
-        raise UnsupportedError(f"{path} is no texture's name, .ktx, .ktx2 and .dds are")
+        raise UnsupportedError(f"cannot write a texture to {path}: its name must end with .ktx, .ktx2 or .dds")

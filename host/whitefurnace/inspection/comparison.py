@@ -145,7 +145,8 @@ def _levels(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
     layers = {found.levels[0].texels.shape[0] if found.kind == "cube array" else 0 for found in (a, b)}
     if len(layers) > 1:
         raise UnsupportedError(
-            f"{a.path} is a {a.kind} and {b.path} a {b.kind}: arrays are compared with arrays of as many layers"
+            f"{a.path} is a {a.kind} and {b.path} a {b.kind}: an array can be compared only with an array "
+            "of as many layers"
         )
     shown: list[tuple[Level, Level]] = []
     for one, other in _matched(a, b, notices):
@@ -196,8 +197,8 @@ def _matched(a: Contents, b: Contents, notices: list[str]) -> list[tuple[Level, 
     one, other = by_roughness[0] if by_roughness else (a.levels[0], b.levels[0])
     if not by_roughness and one.roughness is not None and other.roughness is not None:
         raise UnsupportedError(
-            f"{a.path} and {b.path} have no level of one roughness: "
-            f"r = {one.roughness:.4g} and r = {other.roughness:.4g}"
+            f"{a.path} and {b.path} have no level of the same roughness: the first that "
+            f"could be compared have r = {one.roughness:.4g} and r = {other.roughness:.4g}"
         )
     return [(one, other)]
 
@@ -215,7 +216,7 @@ def _size(level: Level) -> str:
 def _colours(texels: np.ndarray) -> np.ndarray:
     """Return three channels: grey is repeated, coverage is left out."""
     if texels.shape[-1] == 2:
-        raise UnsupportedError("a cube or lat-long of two channels is no radiance and is not compared")
+        raise UnsupportedError("a cube or lat-long of two channels cannot be compared: radiance has 1, 3 or 4 channels")
     return np.repeat(texels, 3, -1) if texels.shape[-1] == 1 else texels[..., :3]
 
 
@@ -436,7 +437,7 @@ def _parted(found: Contents) -> Contents:
 def _turned(found: Contents, axes: np.ndarray) -> Contents:
     """Turn contents from `axes` to ours. Raises UnsupportedError for contents without directions."""
     if not _is_sphere(found) and found.levels:
-        raise UnsupportedError(f"{found.path} holds {found.kind}: axes are of cubes and lat-longs")
+        raise UnsupportedError(f"{found.path} holds {found.kind}, and only cubes and lat-longs have axes")
     levels = tuple(replace(level, texels=_along(level.texels, axes, found)) for level in found.levels)
     irradiance = found.irradiance and replace(found.irradiance, texels=_along(found.irradiance.texels, axes, found))
     sh = None if found.sh is None else turned(found.sh, axes.T)
@@ -450,8 +451,8 @@ def _along(texels: np.ndarray, axes: np.ndarray, found: Contents) -> np.ndarray:
     rows, columns, _ = texels.shape
     if abs(axes[1, 1]) != 1 or columns % 4:
         raise UnsupportedError(
-            f"{found.path} is a lat-long: axes that move y, or a width that is no multiple of 4, "
-            "would have its texels resampled"
+            f"{found.path} is a lat-long: its axes must keep y, and its width must be a multiple of 4; "
+            "otherwise its texels would have to be resampled"
         )
     d = axes @ latlong_centres(rows, columns, rows // 2 * columns + np.arange(columns))
     column = np.rint((np.arctan2(d[2], d[0]) / (2 * math.pi) + 0.5) * columns - 0.5).astype(int) % columns
@@ -474,7 +475,8 @@ def _tables(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
     if not alike:
         shapes = (" × ".join(map(str, found.levels[0].texels.shape[:-1])) for found in (a, b))
         raise UnsupportedError(
-            f"{a.path} and {b.path} are tables of {' and '.join(shapes)} texels, tables of one size are compared"
+            f"{a.path} and {b.path} are tables of {' and '.join(shapes)} texels; "
+            "only tables of the same size can be compared"
         )
     for one, other in alike:
         yield from _table(other.name, one, other, notices)

@@ -270,7 +270,7 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
             raise UsageError(f"integral {entry.name} needs NoV, the cosine of the view angle")
         columns["NoV"] = _view(given.pop("NoV"), backfacing)
         if not isotropic and "phi" in given:
-            columns["phi"] = _number("phi", given.pop("phi"))
+            columns["phi"] = _finite_array("phi", given.pop("phi"))
     names = {p.name for choice in slots.values() for p in choice.model.parameters}
     used: set[str] = set()
     for slot, choice in slots.items():
@@ -308,7 +308,7 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
     return Grid(shape, columns, bool(rgb))
 
 
-def _number(name: str, given: Any) -> np.ndarray:
+def _finite_array(name: str, given: Any) -> np.ndarray:
     try:
         array = np.asarray(given, np.float64)
     except (TypeError, ValueError):
@@ -320,7 +320,7 @@ def _number(name: str, given: Any) -> np.ndarray:
 
 def _view(given: Any, backfacing: str | None) -> np.ndarray:
     """n·v in [0, 1], views from behind dealt with as asked."""
-    NoV = _number("NoV", given)
+    NoV = _finite_array("NoV", given)
     if backfacing is not None and backfacing not in BACKFACING:
         raise UsageError(f"unknown backfacing {backfacing!r}{nearest(backfacing, BACKFACING)}")
     if backfacing == "clamp":

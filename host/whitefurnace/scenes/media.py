@@ -104,11 +104,11 @@ def named_media(texts: Sequence[str], scene: Scene) -> dict[str, Medium]:
         if name in found:
             raise UsageError(f"--medium {text}: {name or 'the scene'} has a medium already")
         own = next((m for m in scene.materials if m.name == name), None)
-        found[name] = _numbers(text, rest, own) if "=" in rest else medium(rest)
+        found[name] = _medium_of_values(text, rest, own) if "=" in rest else medium(rest)
     return found
 
 
-def _numbers(text: str, rest: str, own: Material | None) -> Medium:
+def _medium_of_values(text: str, rest: str, own: Material | None) -> Medium:
     given: dict[str, str] = {}
     for part in rest.split(","):
         name, equals, value = part.partition("=")
@@ -126,14 +126,14 @@ def _numbers(text: str, rest: str, own: Material | None) -> Medium:
         raise UsageError(f"--medium {text}: give σa, or distance and color")
 
     def triple(name: str, usual: float) -> Triple:
-        values = [_number(text, name, v) for v in given.get(name, repr(usual)).split("/")]
+        values = [_finite_value(text, name, v) for v in given.get(name, repr(usual)).split("/")]
         if len(values) not in (1, 3):
             raise UsageError(f"--medium {text}: {name} is one number, or three as R/G/B")
         r, g, b = values * (3 // len(values))
         return r, g, b
 
     def one(name: str, usual: float) -> float:
-        return _number(text, name, given[name]) if name in given else usual
+        return _finite_value(text, name, given[name]) if name in given else usual
 
     per_metre = _per_metre(triple("scattering", 0.0))
     g, ior = one("g", 0.0), one("ior", 1.5 if own is None else _ior(own))
@@ -142,7 +142,7 @@ def _numbers(text: str, rest: str, own: Material | None) -> Medium:
     return Medium(_per_metre(triple("absorption", 0.0)), per_metre, g, ior)
 
 
-def _number(text: str, name: str, value: str) -> float:
+def _finite_value(text: str, name: str, value: str) -> float:
     try:
         found = float(value)
     except ValueError:
