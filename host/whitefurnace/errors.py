@@ -63,11 +63,23 @@ def of_code(code: int) -> type[WhitefurnaceError] | None:
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:
-    """Return the end of an error message that suggests the choice closest to `name`, or lists all choices."""
+    """Return the end of an error message that suggests the choice closest to `name`, or lists all choices.
+
+    Case does not count, nor whether words are joined by _, - or a space; among names that differ by case alone, the
+    closest in case is suggested.
+    """
     choices = list(choices)
     if not choices:
         return "; there is none"
-    close = difflib.get_close_matches(name, choices, n=1, cutoff=0.5)
+    alike: dict[str, list[str]] = {}
+    for choice in choices:
+        alike.setdefault(_folded(choice), []).append(choice)
+    close = difflib.get_close_matches(_folded(name), alike, n=1, cutoff=0.5)
     if close:
-        return f"; did you mean {close[0]!r}?"
+        best = max(alike[close[0]], key=lambda choice: difflib.SequenceMatcher(None, name, choice).ratio())
+        return f"; did you mean {best!r}?"
     return f"; known: {', '.join(sorted(choices))}"
+
+
+def _folded(name: str) -> str:
+    return name.casefold().replace("-", "_").replace(" ", "_")

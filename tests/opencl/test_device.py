@@ -71,6 +71,96 @@ def test_an_unknown_name_lists_what_there_is():
         choose_device("999")
 
 
+def test_a_platform_comes_before_a_device_of_that_name(fresh, monkeypatch):
+    """`intel` is Intel's runtime, although the device of the other, preferred platform is an Intel CPU."""
+
+    def listed(platform, name):
+        return SimpleNamespace(platform=SimpleNamespace(name=platform), name=name)
+
+    pocl = listed("Portable Computing Language", "cpu-skylake-Intel(R) Xeon(R)")
+    intel = listed("Intel(R) OpenCL", "Intel(R) Xeon(R)")
+    monkeypatch.setattr(devices, "_listed", [pocl, intel])
+    monkeypatch.setattr(devices, "_try", lambda raw: (raw, "works"))
+    for name in ("intel", "Intel(R) OpenCL: Intel(R) Xeon(R)"):
+        assert choose_device(name) is intel
+    assert (
+        choose_device("pocl") is choose_device("portable") is choose_device("skylake") is choose_device("xeon") is pocl
+    )
+    monkeypatch.setattr(devices, "_listed", [pocl])
+    assert choose_device("intel") is pocl  # nothing else is called that
+
+
+FORK = """
+import multiprocessing, os, signal, sys
+import numpy as np
+import whitefurnace
+
+def albedo(NoV):
+    signal.alarm(60)  # what hangs dies
+    try:
+        return float(whitefurnace.integrate("albedo", ndf="ggx", NoV=NoV, alpha=0.3).values)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+
+if __name__ == "__main__":
+    parent = albedo(0.5) if "used" in sys.argv else None
+    with multiprocessing.get_context(sys.argv[1]).Pool(2) as pool:
+        for found in pool.map(albedo, [0.5, 0.5, 0.5]):
+            print(found)
+    print(parent)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_fork_after_use_is_refused_at_once_and_before_it_works(tmp_path):
+    script = tmp_path / "pool.py"
+    script.write_text(FORK)
+
+    def lines(*argv):
+        done = subprocess.run([sys.executable, script, *argv], capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    used = lines("fork", "used")
+    assert len(used) == 4 and 0 < float(used.pop()) < 1
+    assert all(line.startswith("DeviceError: ") and "use spawn" in line for line in used)
+    fresh = lines("fork")
+    assert fresh.pop() == "None" and len({float(line) for line in fresh}) == 1
+    spawned = lines("spawn", "used")
+    assert len(set(spawned)) == 1 and 0 < float(spawned[0]) < 1
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_process_drops_what_its_parent_held(device):
+    """Every call of a device that the parent made is refused, and the process ends without a call of the driver."""
+    buffer = device.array(numbers(device))
+    kernel = device.build(SCALE, {"FACTOR": 2}).kernel("scale")
+    calls = [
+        buffer.read,
+        device.finish,
+        choose_device,
+        find_devices,
+        lambda: device.empty(4, np.float32),
+        lambda: device.build(SCALE, {"FACTOR": 3}),
+        lambda: kernel((256,), buffer, buffer, np.float32(1), None),
+    ]
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        refused = 0
+        for call in calls:
+            try:
+                call()
+            except DeviceError as error:
+                refused += "use spawn" in str(error)
+        devices._drain()
+        os.write(write, bytes([refused]))
+        os._exit(0)
+    os.close(write)
+    assert os.read(read, 1) == bytes([len(calls)])
+    assert os.waitpid(child, 0)[1] == 0
+
+
 def test_no_opencl_at_all(fresh, monkeypatch):
     def missing():
         raise ImportError("libOpenCL.so.1: cannot open shared object file")

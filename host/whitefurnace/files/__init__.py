@@ -3,6 +3,7 @@
 Only modules of this package import OpenImageIO, and only when they need it: loading it would slow down `--help`.
 """
 
+import whitefurnace.files.forks  # noqa: F401  it registers what a forked process needs
 from whitefurnace.files.arrays import is_arrays, read_header, read_npy, read_npz
 from whitefurnace.files.atomic import Transaction, digest_file, write_atomic
 from whitefurnace.files.codec import decode, encode, require_encoder

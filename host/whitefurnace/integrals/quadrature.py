@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import difflib
+import inspect
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -263,6 +265,12 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
     isotropic = (
         all(choice.model.isotropic for choice in slots.values()) and "brdf" not in slots and entry.name != "radiance"
     )
+    names = {p.name for choice in slots.values() for p in choice.model.parameters}
+    known = ["NoV", *([] if isotropic else ["phi"]), *sorted(names)] if entry.view else sorted(names)
+    qualified_names = {f"{slot}_{p.name}" for slot, choice in slots.items() for p in choice.model.parameters}
+    # Before what is missing: a misspelt name is the reason why another is missing.
+    for name in sorted(set(given) - {*known, *qualified_names}):
+        raise UsageError(f"integral {entry.name} has no parameter {name!r}{_suggested(name, known)}")
     columns["NoV"] = np.ones(())
     columns["phi"] = np.zeros(())
     if entry.view:
@@ -271,7 +279,6 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
         columns["NoV"] = _view(given.pop("NoV"), backfacing)
         if not isotropic and "phi" in given:
             columns["phi"] = _finite_array("phi", given.pop("phi"))
-    names = {p.name for choice in slots.values() for p in choice.model.parameters}
     used: set[str] = set()
     for slot, choice in slots.items():
         for p in choice.model.parameters:
@@ -290,10 +297,8 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
             else:
                 raise UsageError(f"{where} needs {p.name}, {p.about}")
             columns[qualified] = p.check(value, where)
-    unknown = sorted(set(given) - used)
-    if unknown:
-        known = ["NoV", *([] if isotropic else ["phi"]), *sorted(names)] if entry.view else sorted(names)
-        raise UsageError(f"integral {entry.name} has no parameter {unknown[0]!r}{nearest(unknown[0], known)}")
+    for name in sorted(set(given) - used):
+        raise UsageError(f"{name!r} is given, and for each model that has it also with the name of its slot; give one")
     if rgb:
         columns = {k: v if k in rgb else np.asarray(v)[..., None] for k, v in columns.items()}
     try:
@@ -306,6 +311,14 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
     if 0 in shape:
         raise UsageError("parameters hold no cell: an array is empty")
     return Grid(shape, columns, bool(rgb))
+
+
+def _suggested(name: str, known: Sequence[str]) -> str:
+    """Return the end of the error message for an unknown parameter: a misspelt keyword of `integrate` is one too."""
+    keywords = [key for key in inspect.signature(integrate).parameters if key not in ("name", "parameters")]
+    # At .8 and above one or two letters differ.
+    close = difflib.get_close_matches(name.casefold(), keywords, n=1, cutoff=0.8)
+    return nearest(name, close or known)
 
 
 def _finite_array(name: str, given: Any) -> np.ndarray:

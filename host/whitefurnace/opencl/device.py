@@ -181,9 +181,40 @@ def _provide_cache() -> None:
 
 def _opencl() -> Any:
     """The pyopencl module; ImportError where it or its OpenCL library cannot be loaded."""
+    _refuse_after_fork()
     import pyopencl
 
     return pyopencl
+
+
+_lost: list[Any] | None = None
+"""In a process that was forked from one that had used OpenCL: what it must never release. None elsewhere."""
+
+
+def _refuse_after_fork() -> None:
+    """Raise DeviceError in a process that was forked from one that had used OpenCL.
+
+    The threads of a driver do not come along in a fork, so that any call could wait for them without end.
+    """
+    if _lost is not None:
+        raise DeviceError(
+            "this process was forked from one that had used OpenCL, whose drivers do not survive a fork: use spawn, as "
+            'multiprocessing.get_context("spawn"), or use whitefurnace only in the forked processes'
+        )
+
+
+def _after_fork() -> None:
+    """Close OpenCL in a forked process where its parent had used it."""
+    global _lost, _lock
+    _lock = threading.RLock()  # another thread of the parent may have held it
+    if _listed is not None and _lost is None:
+        # The devices are kept: to release them calls the driver too, and so does the end of a process.
+        _lost = [_listed, list(_live), dict(_chosen)]
+        _live.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_after_fork)
 
 
 _lock = threading.RLock()
@@ -213,6 +244,7 @@ def _preference(raw: Any) -> tuple[Any, ...]:
 def _list_devices() -> list[Any]:
     """Every pyopencl device, in order of preference; empty without an OpenCL library or platform."""
     global _listed
+    _refuse_after_fork()
     with _lock:
         if _listed is None:
             with _quiet():
@@ -233,6 +265,12 @@ def _list_devices() -> list[Any]:
 
 def _label(raw: Any) -> str:
     return f"{raw.platform.name.strip()}: {raw.name.strip()}"
+
+
+def _platform_names(raw: Any) -> str:
+    """The name of a device's platform in lower case, and how its users call it."""
+    name = str(raw.platform.name).strip().lower()
+    return f"{name} pocl" if name.startswith("portable computing language") else name
 
 
 def _address(raw: Any) -> str:
@@ -296,9 +334,9 @@ def find_devices() -> list[Candidate]:
 def choose_device(name: str | None = None) -> Device:
     """Return the first device, best first, that gives right answers; the same object for the whole process.
 
-    name: an index of `find_devices` or a part of "platform: device" in any case; by default the variable
-    WHITEFURNACE_DEVICE. Only as many devices are tried as it takes. Raises UsageError where no device has that name,
-    and DeviceError where none works.
+    name: an index of `find_devices`, or a part of "platform: device" in any case, where platforms that have it come
+    before devices that do; by default the variable WHITEFURNACE_DEVICE. Only as many devices are tried as it takes.
+    Raises UsageError where no device has that name, and DeviceError where none works.
     """
     if name is None:
         name = os.environ.get("WHITEFURNACE_DEVICE") or None
@@ -312,11 +350,9 @@ def choose_device(name: str | None = None) -> Device:
         elif addressed:
             wanted = addressed
         else:
-            labels = [_label(raw).lower() for raw in listed]
-            wanted = [
-                raw
-                for raw, label in zip(listed, labels, strict=True)
-                if text in label or text in label.replace(":", "")
+            # Platforms first: "intel" means Intel's runtime, and not another one's device that is an Intel CPU.
+            wanted = [raw for raw in listed if text in _platform_names(raw)] or [
+                raw for raw in listed if text in _label(raw).lower() or text in _label(raw).lower().replace(":", "")
             ]
         if not wanted:
             there = ", ".join(f"{index} = {_label(raw)}" for index, raw in enumerate(listed))
@@ -543,7 +579,7 @@ class Device:
         options: names and values, each passed as -D. Floats are written as Python does, without a suffix. Raises
         DeviceError with the compiler's first errors.
         """
-        cl = _opencl()
+        cl = _opencl()  # refused in a forked process before the lock, which a thread of the parent may have held
         # No fast-math: explicit lanes gain nothing by it and compensated sums break under it.
         flags = ["-cl-std=CL1.2", *(_define(name, value) for name, value in sorted((options or {}).items()))]
         key = (text, " ".join(flags))
@@ -626,6 +662,7 @@ class Device:
             raise DeviceError(
                 f"kernel {kernel.name}: the global size {global_size} is not a multiple of the local size {local_size}"
             )
+        _refuse_after_fork()
         with self._lock, _translated(self, f"kernel {kernel.name}"):
             kernel._raw.set_args(*(arg._memory if isinstance(arg, Buffer) else arg for arg in args))
             event = _opencl().enqueue_nd_range_kernel(self._queue, kernel._raw, global_size, local_size)
@@ -647,6 +684,7 @@ class Device:
 
     def finish(self) -> None:
         """Wait until all launches are done. Raises DeviceError where one failed."""
+        _refuse_after_fork()
         with self._lock, _translated(self, "running a kernel"):
             self._settle(len(self._pending))
             self._queue.finish()

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.engines.presets import Engine, File, engine_of_data, engines
-from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
+from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError, nearest
 from whitefurnace.files import (
     decode,
     digest_file,
@@ -471,6 +471,7 @@ def dictionary(value: Any) -> dict[str, Any]:
 
 SIZE_RANGE = (8, 2048)
 MOST_PIXELS = 1 << 26
+BACKGROUNDS = ("environment", "plain")
 EXPOSURES = 64.0
 RADIUS = 0.45
 """Radius of a sphere, in edges of its cell."""
@@ -553,8 +554,8 @@ def drawn(
     in_range("size", size, SIZE_RANGE)
     if columns * rows * size * size > MOST_PIXELS:
         raise UsageError(f"{columns} × {rows} spheres of {size} pixels are more than {MOST_PIXELS} pixels")
-    if background not in ("environment", "plain"):
-        raise UsageError(f"background {background!r} is neither environment nor plain")
+    if background not in BACKGROUNDS:
+        raise UsageError(f"unknown background {background!r}{nearest(background, BACKGROUNDS)}")
     index, cover, n = sphere(size)
     v = np.broadcast_to(np.array([[0.0], [0.0], [1.0]]), n.shape)
     picture = np.empty((rows * size, columns * size, 3))

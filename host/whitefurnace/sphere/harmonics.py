@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from whitefurnace.errors import InputError, UsageError
+from whitefurnace.errors import InputError, UsageError, nearest
 
 BANDS = np.array([0, 1, 1, 1, 2, 2, 2, 2, 2])
 """Degree l of each coefficient."""
@@ -156,17 +156,23 @@ class Windowed:
     after: np.ndarray  # (..., 3): and with it
 
 
+WINDOWS = ("auto", "none")
+"""The named modes of a window; a number is one too."""
+
+
 def sh_window(text: str) -> str | float:
     """Return the mode in the text of `--sh window=auto|none|X`. Raises UsageError in one sentence."""
     name, equals, value = text.partition("=")
     if name != "window" or not equals:
         raise UsageError(f"SH option {text!r} is not window=auto, window=none or window=X")
-    if value in ("auto", "none"):
+    if value in WINDOWS:
         return value
     try:
         return _cutoff(float(value))
     except ValueError:
-        raise UsageError(f"SH window {value!r} is neither auto nor none nor a number") from None
+        raise UsageError(
+            f"SH window {value!r} is neither auto nor none nor a number{nearest(value, WINDOWS)}"
+        ) from None
 
 
 def _cutoff(cutoff: float) -> float:
@@ -204,8 +210,8 @@ def windowed(sh: np.ndarray, mode: str | float = "auto") -> Windowed:
         raise InputError("SH coefficients are not finite")
     before = least_irradiance(sh)
     if isinstance(mode, str):
-        if mode not in ("auto", "none"):
-            raise UsageError(f"SH window {mode!r} is neither auto nor none nor a number")
+        if mode not in WINDOWS:
+            raise UsageError(f"SH window {mode!r} is neither auto nor none nor a number{nearest(mode, WINDOWS)}")
         window = np.ones((*sh.shape[:-2], 3)) if mode == "none" else _nearest(cosine(sh), before)
     else:
         window = np.broadcast_to(sinc_window(_cutoff(float(mode))), (*sh.shape[:-2], 3))
