@@ -1,1 +1,1 @@
-"""Derives what a scene needs of a bake and what each approximation costs on it."""
+"""Derives which parts of a bake a scene needs, and the error that each approximation makes on it."""

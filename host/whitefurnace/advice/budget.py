@@ -31,10 +31,10 @@ def usual(engine: Engine, *, size: int | None = None) -> Chain:
 
 
 def measure(scene: Scene, env: Environment, engine: Engine, recipe: Chain | None, device: Device) -> Budget:
-    """The error budget of a scene in an environment under an engine's bake.
+    """Measure the error budget of a scene in an environment under an engine's bake.
 
-    recipe: the chain that is baked, None for the engine's usual one. Raises InputError for a scene without lit
-    materials, UnsupportedError for an engine that gets no prefiltered chain, DeviceError.
+    recipe: the chain that is baked; None for the engine's usual one. Raises InputError for a scene without lit
+    materials, UnsupportedError for an engine that gets no prefiltered chain, and DeviceError.
     """
     return ErrorMeter(scene, env, engine, device).budget(recipe or usual(engine))
 
@@ -47,10 +47,11 @@ def of_image(
     device: str | None = None,
     without: Sequence[str] = (),
 ) -> tuple[Budget, Choice | None]:
-    """The error budget of an engine's usual bake of an image, and the cheapest set of files within a tolerance.
+    """Measure the error budget of an engine's usual bake, and find the cheapest set of files within a tolerance.
 
-    source: a path, or "demo" for the built-in environment. tolerance: RMS, None for no choice. without: parts of the
-    engine's files that are left out. Raises the errors of `ErrorMeter`, `choose`, `environment` and `choose_device`.
+    source: path of an image, or "demo" for the built-in environment. tolerance: largest RMS error, in TOLERANCE_RANGE;
+    None to choose no files. without: parts of the engine's files to leave out. Raises the errors of `ErrorMeter`,
+    `choose`, `environment` and `choose_device`.
     """
     on = choose_device(device)
     env = demo(on) if source == DEMO and not os.path.exists(source) else environment(source)

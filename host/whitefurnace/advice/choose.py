@@ -31,10 +31,11 @@ class Choice:
     """The cheapest set of files within a tolerance.
 
     options       options of `bake` other than --for
-    nbytes        bytes of the files before compression; `usual_nbytes`: of the engine's usual bake
+    nbytes        bytes of the files before compression
+    usual_nbytes  bytes of the files of the engine's usual bake
     error         RMS error of the files, with the error that the filter may add and without the parts in `beyond`
-    whole         RMS error of the engine's picture from them
-    binds         the largest error among the parts that were judged
+    whole         RMS error of the engine's picture from these files
+    binds         the part with the largest error among those that were judged
     met           True if `error` is within the tolerance
     beyond        errors above the tolerance that no choice changes
     tried         number of sets that were measured
@@ -75,16 +76,17 @@ class _Measured:
 
 
 def choose(meter: ErrorMeter, tolerance: float, recipe: Chain) -> Choice:
-    """The cheapest set whose files add at most `tolerance` (RMS) to the picture that exact files give.
+    """Find the cheapest set of files that adds at most `tolerance` (RMS) to the error of the picture from exact files.
 
-    Where exact files are themselves within the tolerance, the whole picture is held to it too. Parts of the files that
-    are over the tolerance and that no choice changes (`Choice.beyond`) are not judged.
+    If the picture from exact files is itself within the tolerance, the whole picture must be too. Parts of the files
+    whose error is above the tolerance and that no choice changes (`Choice.beyond`) are not judged.
 
-    recipe: the engine's usual chain. tolerance: in TOLERANCE_RANGE. The sets vary face sizes, last sizes, numbers of
-    levels, --fit read, table sizes and the filter's tolerance; for raw and exr also harmonics or a cube; for a user's
-    own engine also the pixel formats of its container. The formats of a preset are those that its loader takes.
+    recipe: the engine's usual chain. tolerance: a number in TOLERANCE_RANGE. The sets vary face sizes, last sizes,
+    numbers of levels, --fit read, table sizes and the filter's tolerance; for raw and exr also harmonics or a cube; for
+    a user's own engine also the pixel formats of its container. The formats of a preset are fixed by what its loader
+    accepts.
 
-    Raises UsageError for a tolerance out of range, CheckError where the filter meets no tolerance.
+    Raises UsageError for a tolerance out of range, and CheckError where the filter meets no tolerance.
     """
     low, high = TOLERANCE_RANGE
     if not low <= tolerance <= high:

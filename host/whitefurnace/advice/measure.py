@@ -64,15 +64,15 @@ class Entry:
 
 @dataclass(frozen=True)
 class Budget:
-    """Errors of a scene in an environment under one engine, one entry an approximation.
+    """The errors of a scene in an environment under one engine, one entry for each approximation.
 
-    levels    (texels a face edge, perceptual roughness) of each level
+    levels    (texels of a face edge, perceptual roughness) of each level
     points    number of points that were shaded
-    entries   in the order in which the engine makes the approximations
-    files     error that all of the files add to the picture from exact ones
+    entries   entries in the order in which the engine makes the approximations
+    files     error that all of the files together add to the picture from exact files
     floor     error of the picture from exact files against the reference
     whole     error of the engine's picture against the reference
-    accuracy  error (p99) of the reference itself
+    accuracy  error (99th percentile) of the reference itself
     """
 
     engine: str
@@ -98,8 +98,8 @@ class Budget:
 class ErrorMeter:
     """Measures error budgets of one scene and engine in one environment.
 
-    without: the parts of the engine's files that are left out (`presets.reduced`). count: number of points. seed: of
-    their random numbers. Integrals that several chains need are computed once.
+    without: parts of the engine's files that are left out (`engines.engine.reduced`). count: number of points. seed:
+    seed of the random points. Integrals that several chains need are computed once.
 
     Raises UnsupportedError for an engine that gets no prefiltered chain, and the errors of `sample_points`.
     """
@@ -127,18 +127,21 @@ class ErrorMeter:
 
     @property
     def right(self) -> np.ndarray:
-        """(m, 3) reference radiance that errors are measured against."""
+        """Reference radiance of the points, (m, 3), against which errors are measured."""
         return self.integrals.right
 
     def entry(
         self, name: str, kind: Kind, difference: np.ndarray, what: str, *, used: bool = True, bound: bool = False
     ) -> Entry:
-        """The entry of an approximation that changes the radiance of the points by `difference` (m, 3)."""
+        """Return the entry of an approximation that changes the radiance of the points by `difference` (m, 3).
+
+        what, used, bound: fields of the `Entry`.
+        """
         off = texel_errors(self.right + difference, self.right, float(self.right.mean()))
         return Entry(name, kind, float(np.sqrt((off * off).mean())), float(np.quantile(off, 0.95)), what, used, bound)
 
     def budget(self, recipe: Chain, engine: Engine | None = None) -> Budget:
-        """The budget of a chain.
+        """Measure the budget of a chain.
 
         engine: an engine with other files and the same shading; by default the engine of this meter. Raises CheckError
         where a level cannot reach its tolerance.
@@ -160,21 +163,21 @@ class ErrorMeter:
 
     @cached_property
     def floor(self) -> Entry:
-        """The error of the picture from exact files."""
+        """Return the error of the picture from exact files."""
         return self.entry(
             "exact files", "split", self.reads.perfect - self.right, "the engine with these, against the integral"
         )
 
     @cached_property
     def filter_share(self) -> float:
-        """The error (RMS) that a filter of tolerance t may add to the picture, over t."""
+        """Return the RMS error that a filter of tolerance t may add to the picture, divided by t."""
         specular, _ = self.reads.weights(self.integrals.exact_table)
         return self.entry("filter", "files", specular * self.reads.prefiltered, "").rms
 
     # ------------------------------------------------------------------------------------------- the engine's way
 
     def files(self, recipe: Chain, engine: Engine) -> list[Entry]:
-        """Errors of the parts of the files, each as the change of X₀ when that part alone is not exact."""
+        """Measure the error of each part of the files, as the change of X₀ when only that part is not exact."""
         reads, storage = self.reads, Storage.of(engine)
         P, D, AB, X0 = reads.prefiltered, self.integrals.diffuse, self.integrals.exact_table, reads.perfect
         specular, _ = reads.weights(AB)
@@ -229,7 +232,7 @@ class ErrorMeter:
 
     @cached_property
     def split(self) -> tuple[Entry, ...]:
-        """Errors of the split sum: its two parts, then the whole of it."""
+        """Measure the errors of the split sum: first its two parts, then the whole."""
         engine, reads, integrals = self.engine, self.reads, self.integrals
         specular = reads.weights(integrals.exact_table)[0]
         read = reads.prefiltered + (integrals.diffuse - reads.prefiltered) * reads.blend
@@ -255,7 +258,7 @@ class ErrorMeter:
 
     @cached_property
     def model(self) -> tuple[Entry, ...]:
-        """Errors of the engine's reflection model: its multiple scattering and its Fresnel term."""
+        """Measure the errors of the engine's reflection model: of its multiple scattering and of its Fresnel term."""
         specular, rest = self.reads.weights(self.integrals.exact_table)
         schlick = self.integrals.reference(exact=False)
         return (

@@ -46,8 +46,9 @@ Kind = Literal["level", "lobe", "integral", "table", "file", "effect"]
 class Need:
     """One part that a bake could have.
 
-    needed  True or False; None if no image-based table can give it
-    nbytes  bytes before compression in the engine's full set; `kept`: in what the scene needs
+    needed  True or False; None if no image-based table can provide it
+    nbytes  bytes before compression in the engine's full set
+    kept    bytes before compression in what the scene needs
     """
 
     what: str
@@ -62,13 +63,17 @@ class Need:
 class Needs:
     """The parts of an engine's bake that a scene needs.
 
-    own      the engine with only the needed files, None where nothing is needed; `chain` its chain
+    own      the engine with only the needed files, None where nothing is needed
+    chain    the chain of `own`
     full     the engine's usual chain
-    without  parts that are left out; `table`: texels a side of a smaller split-sum table, or None
+    without  names of the parts that are left out
+    table    texels on a side of a smaller split-sum table; None if its size stays
     rows     every part, needed or not
-    tables   options of `lut` for further tables, with a file's name as `output`
+    tables   options of `lut` for further tables, each with a file name as `output`
     cloth    options of a further bake of Charlie's chain, or None
-    nbytes   bytes before compression, and `seconds` predicted processor seconds; `full_...`: of the usual bake
+    nbytes   bytes before compression
+    seconds  predicted seconds of processor time
+    full_nbytes, full_seconds  the same for the engine's usual bake
     """
 
     engine: Engine
@@ -101,14 +106,14 @@ class Needs:
 
 
 def only_text(recipe: Chain) -> str:
-    """The levels that are made, in the form that --only-levels takes."""
+    """Return the range of the levels that are made, in the form that --only-levels takes ("A-B")."""
     assert recipe.only
     return f"{recipe.only[0]}-{recipe.only[1]}"
 
 
 @dataclass(frozen=True)
 class Lobe:
-    """A reflection of a material, with its perceptual roughness as the engine shades it."""
+    """A reflection of a material, with its perceptual roughness in [0, 1] as the engine shades it."""
 
     material: str
     what: str
@@ -116,8 +121,10 @@ class Lobe:
 
 
 def lobes(scene: Scene, least: float = 0.0) -> list[Lobe]:
-    """The GGX lobes of a scene: each material's own and its clear coat's. least: smallest roughness that the engine
-    shades."""
+    """Return the GGX lobes of a scene: each material's own lobe and its clear coat's.
+
+    least: smallest perceptual roughness that the engine shades.
+    """
     found = []
     for m in lit(scene):
         if m["specular"].most > 0 or m["metalness"].most > 0:
@@ -137,8 +144,10 @@ def _at_least(spread: Spread, least: float) -> Spread:
 
 
 def read_shares(found: Sequence[Lobe], recipe: Chain) -> np.ndarray:
-    """Share of all reads that each level of a chain gets, (levels,), if all lobes read equally often. Every level that
-    is read at all has a share above 0."""
+    """Return the share of all reads that each level of a chain gets, (levels,), if all lobes are read equally often.
+
+    A level that is read at all has a share above 0.
+    """
     weights = np.zeros(len(recipe.levels))
     for lobe in found:
         for low, high, share in lobe.roughness.shares:
@@ -152,9 +161,9 @@ def read_shares(found: Sequence[Lobe], recipe: Chain) -> np.ndarray:
 
 
 def smallest(engine: Engine, full: Chain, found: Sequence[Lobe]) -> Chain:
-    """The engine's usual chain, from the first level that is read to the last.
+    """Return the engine's usual chain `full`, cut to the range from the first to the last level that `found` reads.
 
-    Everything that a surface reads stays the same. Where the levels are mips of one texture, all of them stay.
+    Everything that a surface reads stays the same. If the levels are mips of one texture, all of them stay.
     """
     if engine.container == "files":
         return full
@@ -164,8 +173,10 @@ def smallest(engine: Engine, full: Chain, found: Sequence[Lobe]) -> Chain:
 
 
 def diffuse_weight(engine: Engine, m: Material) -> float:
-    """The largest factor by which the engine multiplies E/π for a material, over n·v and the material's roughness;
-    light through the surface counts too."""
+    """Return the largest factor by which the engine multiplies E/π for a material.
+
+    The maximum is over n·v and the material's roughness. Light through the surface counts too.
+    """
     NoV, r = (
         x.ravel()
         for x in np.meshgrid(
@@ -186,7 +197,10 @@ def diffuse_weight(engine: Engine, m: Material) -> float:
 
 
 def needs(scene: Scene, engine: Engine, *, background: bool = False) -> Needs:
-    """The parts of an engine's bake that a scene needs. background: True if the environment itself is visible."""
+    """Decide which parts of an engine's bake a scene needs.
+
+    background: True if the environment itself is visible behind the scene.
+    """
     full = chain(
         lods=engine.lods,
         usual_min=engine.min_size,
@@ -504,7 +518,7 @@ class _Deciding:
 
 
 def seconds(engine: Engine, recipe: Chain) -> float:
-    """Predicted processor seconds of a bake, without reading the image, as `batch --dry-run` states them."""
+    """Predict the seconds of processor time of a bake without reading the image, as `batch --dry-run` states them."""
     pairs = 0
     if engine.needs("specular"):
         pairs += sum(level.pairs for level in plan_chain(recipe, TEXEL))
@@ -551,7 +565,7 @@ def _some(names: Sequence[str]) -> str:
 
 
 def bakes(found: Needs, output: str) -> list[dict[str, Any]]:
-    """The bakes that each environment needs: options of a `BakeRequest`, with the folder as `output`."""
+    """Return the options of a `BakeRequest` for each bake that an environment needs, with the folder as `output`."""
     if found.own is None:
         return []
     made = [{"output": output, **found.options}]
@@ -571,10 +585,11 @@ def write_job(
 ) -> None:
     """Write a job for `batch` that bakes what a scene needs.
 
-    path: a .toml file. Outputs go into a folder of its name next to it. name: the engine as --for takes it.
-    environments: paths or "demo". force: replace another job.
+    path: a .toml file; outputs go into a folder of the same name next to it. name: the engine as --for takes it.
+    environments: paths or "demo". force: replace a file with other contents.
 
-    Raises FileError for another job at `path` or one that cannot be read or written, UsageError for another suffix.
+    Raises FileError for a file with other contents at `path` or one that cannot be read or written, and UsageError for
+    another suffix.
     """
     path = Path(path)
     if path.suffix.lower() != ".toml":
@@ -620,7 +635,7 @@ def _toml(value: Any) -> str:
 
 
 def one_engine(found: Sequence[Engine]) -> Engine:
-    """The engine of a list of one. Raises UsageError for several, since each needs its own sizes."""
+    """Return the engine of a list of one. Raises UsageError for several engines, since each needs its own sizes."""
     if len(found) != 1:
         raise UsageError("scene decides for one engine at a time: give one NAME to --for")
     return found[0]

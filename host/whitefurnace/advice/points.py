@@ -34,13 +34,13 @@ GRAZING = 0.01
 class ScenePoints:
     """Surface points of a scene, all with the same weight.
 
-    material    (m,) index into the scene's materials
+    material    (m,) index of the material in the scene
     color       (m, 3) base colour in [0, 1]
     metal       (m,) metalness in [0, 1]
     roughness   (m,) perceptual roughness in [0, 1]
     f0          (m, 3) F0 of the insulating part
     ior         (m,) index of refraction of the insulating part; 0 where only Schlick's term with `f0` describes it
-    points      normals and view directions
+    points      unit normals and view directions
     notices     sentences about parts of the materials that the points leave out
     """
 
@@ -57,14 +57,14 @@ class ScenePoints:
 def sample_points(scene: Scene, *, least: float = 0.0, count: int = POINTS, seed: int = 0) -> ScenePoints:
     """Draw surface points from the materials of a scene.
 
-    A material gets points in proportion to the primitives that use it. Roughness and metalness are drawn from the
-    material's histograms in equal parts; colours are means. Normals are uniform over the sphere. View directions have
-    the density of a sphere's pixels, proportional to n·v.
+    A material gets points in proportion to the number of primitives that use it. Roughness and metalness are drawn from
+    the material's histograms in equal parts; colours are means. Normals are uniform over the sphere. View directions
+    have the density of a sphere's pixels, proportional to n·v.
 
-    least: the smallest perceptual roughness that the engine shades; lower values are raised to it. A roughness below
-    SMOOTHEST becomes 0, a mirror. count: number of points, in POINTS_RANGE. seed: of the random numbers.
+    least: smallest perceptual roughness that the engine shades; lower values are raised to it. A roughness below
+    SMOOTHEST becomes 0, a mirror. count: number of points, in POINTS_RANGE. seed: seed of the random numbers.
 
-    Raises InputError for a scene in which every material is unlit, UsageError for a count out of range.
+    Raises InputError for a scene in which every material is unlit, and UsageError for a count out of range.
     """
     if not POINTS_RANGE[0] <= count <= POINTS_RANGE[1]:
         raise UsageError(f"points {count} is outside [{POINTS_RANGE[0]}, {POINTS_RANGE[1]}]")

@@ -1,5 +1,4 @@
-"""Computes the light that an engine reads from its files at the points of a scene, and the picture that it makes of
-it."""
+"""Computes the light that an engine reads from its files at the points of a scene, and the picture that it shows."""
 
 from __future__ import annotations
 
@@ -72,24 +71,24 @@ class EngineReads:
 
     @cached_property
     def looked_up(self) -> np.ndarray:
-        """(3, m) world directions in which the engine reads the chain."""
+        """World directions in which the engine reads the chain, (3, m)."""
         return looked_up(self.engine, self.points.n, self.points.v, self.sampled.roughness)
 
     @cached_property
     def prefiltered(self) -> np.ndarray:
-        """Exact prefiltered radiance (n = v = r) in the directions that the engine reads."""
+        """Exact prefiltered radiance (n = v = r) in the directions in which the engine reads it, (m, 3)."""
         return self.integrals.each(
             lambda g: self.integrals.lobe(single(g.roughness), self.looked_up[:, g.index], g.count)
         )
 
     @cached_property
     def blend(self) -> np.ndarray:
-        """(m, 1) share of E/π that the engine blends into the prefiltered radiance."""
+        """Share of E/π that the engine blends into the prefiltered radiance, (m, 1) in [0, 1]."""
         r = self.sampled.roughness
         return np.broadcast_to(self.engine.blend_formula(r=r, alpha=r * r), r.shape)[:, None]
 
     def weights(self, table: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The engine's weights of the specular radiance and of E/π, (m, 3) each.
+        """Return the engine's weights of the specular radiance and of E/π, (m, 3) each.
 
         table: the split-sum terms (A, B), (m,) each.
         """
@@ -106,7 +105,7 @@ class EngineReads:
         return np.broadcast_to(made[0], s.color.shape), np.broadcast_to(made[1], s.color.shape)
 
     def shown(self, radiance: np.ndarray, diffuse: np.ndarray, table: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
-        """(m, 3) radiance that the engine shows, put together as in `shading.shade`.
+        """Return the radiance that the engine shows, (m, 3), combined as in `shading.shade`.
 
         radiance: prefiltered radiance (m, 3). diffuse: E/π (m, 3). table: the split-sum terms (A, B), (m,) each.
         """
@@ -115,7 +114,7 @@ class EngineReads:
 
     @cached_property
     def perfect(self) -> np.ndarray:
-        """X₀, the radiance that the engine would show from files without any error."""
+        """X₀: the radiance that the engine would show from files without any error, (m, 3)."""
         return self.shown(self.prefiltered, self.integrals.diffuse, self.integrals.exact_table)
 
     # ------------------------------------------------------------------------------------------- from files
@@ -133,11 +132,14 @@ class EngineReads:
                 self._lights[key_of(recipe)] = made, filtered
 
     def is_baked(self, recipe: Chain) -> bool:
-        """True if the chain was baked before."""
+        """Return whether the chain has been baked."""
         return key_of(recipe) in self._lights
 
     def read(self, recipe: Chain, form: str) -> np.ndarray:
-        """(m, 3) prefiltered radiance as it is read from the levels of a chain in the pixel format `form`."""
+        """Return prefiltered radiance (m, 3) as the engine reads it from the levels of a chain.
+
+        form: the pixel format of the levels.
+        """
         key = (key_of(recipe), form)
         if key not in self._reads:
             self.bake([recipe])
@@ -148,7 +150,9 @@ class EngineReads:
         return self._reads[key]
 
     def between(self, recipe: Chain) -> np.ndarray:
-        """(m, 3) prefiltered radiance as it is read between levels that have exact values in every direction."""
+        """Return prefiltered radiance (m, 3) as it is read between two levels whose texels are exact in every
+        direction.
+        """
         own = [single(r) for _, r in recipe.levels]
         mixtures = [
             mixture or lobe
@@ -174,16 +178,18 @@ class EngineReads:
         return value
 
     def stated(self, recipe: Chain) -> np.ndarray:
-        """(m,) stated errors (p99) of the levels that each point reads, weighted as they are read."""
+        """Return the stated error (99th percentile) at each point, (m,): that of its two levels, weighted as they
+        are read.
+        """
         self.bake([recipe])
         errors = np.array([level.error for level in self._lights[key_of(recipe)][1].levels])
         lod = shading.lods(self.engine, self.sampled.roughness, len(errors), recipe.size)
         return np.asarray(np.maximum(1 - np.abs(lod[:, None] - np.arange(len(errors))), 0) @ errors)
 
     def diffuse_read(self, recipe: Chain, how: str, form: str) -> np.ndarray:
-        """(m, 3): E/π as it is read from stored diffuse light.
+        """Return E/π (m, 3) as the engine reads it from stored diffuse light.
 
-        how: "sh" for harmonics, "cube" for an irradiance cube, "level" for the level of r = 1. form: pixel format.
+        how: "sh" for harmonics, "cube" for an irradiance cube, "level" for the level of r = 1. form: the pixel format.
         """
         key = (key_of(recipe), how, form)
         if key not in self._reads:
@@ -201,9 +207,10 @@ class EngineReads:
         return self._reads[key]
 
     def table(self, dfg: Dfg | None, form: str | None) -> tuple[np.ndarray, np.ndarray]:
-        """The split-sum terms (A, B), (m,) each, as they are read from a table.
+        """Return the split-sum terms (A, B), (m,) each, as the engine reads them from a table.
 
-        dfg: the table's size and axes; None: no table, so Karis's fit. form: pixel format, None for float32.
+        dfg: size and axes of the table; None for an engine without one, which gets Karis's fit. form: the pixel format;
+        None for float32.
         """
         NoV, r = self.points.NoV, self.sampled.roughness
         if dfg is None:
@@ -219,10 +226,10 @@ class EngineReads:
         return shading.split_sum(engine, self._tables[dfg, form], NoV, r)
 
     def picture(self, recipe: Chain, engine: Engine, but: Sequence[str] = ()) -> np.ndarray:
-        """(m, 3) radiance that the engine shows from its files.
+        """Return the radiance that the engine shows from its files, (m, 3).
 
-        engine: what the files are; its shading is that of this object's engine. but: parts of the files that are exact
-        here, any of "format", "diffuse" and "table".
+        engine: describes the files; the shading is always that of this object's engine. but: parts of the files that
+        are exact here, any of "format", "diffuse" and "table".
         """
         storage = Storage.of(engine)
         return self.shown(
@@ -235,15 +242,15 @@ class EngineReads:
 
 
 def key_of(recipe: Chain) -> str:
-    """Text that is equal for equal chains."""
+    """Return a text that is equal for equal chains and differs otherwise."""
     return repr(recipe.canonical())
 
 
 def as_stored(levels: Sequence[np.ndarray], form: str, *, cube: bool = True) -> list[np.ndarray]:
-    """Levels after a round trip through a pixel format, "" or "float32" for unchanged ones.
+    """Return levels after a round trip through a pixel format; "" and "float32" leave them unchanged.
 
-    levels: cubes (6, s, s, 3), or with cube=False images (h, w, 3). Raises UnsupportedError for BC6H and ASTC without
-    their packages.
+    levels: cubes (6, s, s, 3), or with cube=False images (h, w, 3). Raises UnsupportedError for BC6H and ASTC where
+    their packages are not installed.
     """
     if form in ("", "float32"):
         return list(levels)
@@ -256,7 +263,7 @@ def as_stored(levels: Sequence[np.ndarray], form: str, *, cube: bool = True) -> 
 
 
 def writable_formats(file: File) -> list[str]:
-    """Pixel formats of a file's container that have three channels and that this installation can write."""
+    """List the pixel formats of a file's container that have three channels and that this installation can write."""
     found = []
     for form in FORMATS[file.suffix]:
         if form == "rg16f":

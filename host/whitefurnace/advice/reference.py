@@ -34,8 +34,8 @@ class Group:
     """The points of one roughness and their specular integrals.
 
     index  indices of the points
-    count  samples taken for each of them
-    R, E   (m, 2, 3) radiance and (m, 2) albedo by Schlick's term, for F0 = 0 and F0 = 1
+    count  samples taken for each point
+    R, E   radiance (m, 2, 3) and albedo (m, 2) with Schlick's Fresnel term, for F0 = 0 and F0 = 1
     """
 
     roughness: float
@@ -48,8 +48,8 @@ class Group:
 class PointIntegrals:
     """Integrals of the reflected light at the points of a scene in one environment.
 
-    Arrays are (m, 3) linear radiance, one row a point, unless stated otherwise. `right` is the reference that errors
-    are measured against; `accuracy` is the 99th percentile of its own error. Each integral is computed once, on first
+    Arrays are linear radiance (m, 3), one row a point, unless stated otherwise. `right` is the reference against which
+    errors are measured; `accuracy` is the 99th percentile of its own error. Each integral is computed once, on first
     use.
     """
 
@@ -70,7 +70,7 @@ class PointIntegrals:
         return Group(r, index, count, *self.truth.reflected(one, some, count))
 
     def each(self, made: Callable[[Group], np.ndarray]) -> np.ndarray:
-        """(m, 3) values of all points, from a function that gives those of one group."""
+        """Return the values of all points, (m, 3), from a function `made` that gives those of one group."""
         out = np.empty((len(self.sampled.roughness), 3))
         for g in self.groups:
             out[g.index] = made(g)
@@ -79,9 +79,10 @@ class PointIntegrals:
     # ------------------------------------------------------------------------------------------- means of radiance
 
     def mean(self, roughness: float, points: Points, count: int) -> np.ndarray:
-        """(m, 3): ∫ L D (n·l) dω / ∫ D (n·l) dω, the mean radiance over the GGX lobe that v sees, from `count` samples.
+        """Return the mean radiance over the GGX lobe that v sees, (m, 3): ∫ L D (n·l) dω / ∫ D (n·l) dω.
 
-        For v = n this is the value of a prefiltered level.
+        roughness: perceptual roughness. count: samples at each point. For v = n this is the value of a prefiltered
+        level.
         """
         if roughness == 0:
             return radiance_at(self.env, mirrored(points))
@@ -89,7 +90,7 @@ class PointIntegrals:
         return np.asarray(R[:, 0] / E)
 
     def lobe(self, mixture: Sequence[tuple[float, float]], d: np.ndarray, count: int) -> np.ndarray:
-        """(m, 3): the exact value of a prefiltered level in directions d (3, m).
+        """Return the exact value of a prefiltered level in directions d (3, m): (m, 3).
 
         mixture: (weight, perceptual roughness) of each lobe of the level. count: samples; more are taken where the
         points need more.
@@ -103,12 +104,12 @@ class PointIntegrals:
 
     @cached_property
     def own_view(self) -> np.ndarray:
-        """Mean radiance over the GGX lobe as it is seen from v."""
+        """Mean radiance over the GGX lobe as it is seen from v, (m, 3)."""
         return self.each(lambda g: self.mean(g.roughness, self.points.some(g.index), g.count))
 
     @cached_property
     def diffuse(self) -> np.ndarray:
-        """E/π, the irradiance at n over π."""
+        """E/π: irradiance at n divided by π, (m, 3)."""
         return bilinear(irradiance(self.env, size=CUBE, device=self.device).values, self.points.n)
 
     # ------------------------------------------------------------------------------------------- reflected light
@@ -123,8 +124,10 @@ class PointIntegrals:
         return R[:, 0], E[:, :1], R[:, 1] - R[:, 0], E[:, 1:] - E[:, :1]
 
     def reflected(self, F0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(m, 3) radiance and (m, 3) albedo of single scattering by Schlick's term of F0 (m, 3). Both are linear in
-        F0."""
+        """Return radiance and albedo of single scattering with Schlick's Fresnel term, (m, 3) each.
+
+        F0: reflectance at normal incidence, (m, 3). Both values are linear in it.
+        """
         R, E, more_R, more_E = self._once
         return R + F0 * more_R, E + F0 * more_E
 
@@ -136,7 +139,7 @@ class PointIntegrals:
 
     @cached_property
     def seen(self) -> np.ndarray:
-        """Mean radiance weighted by the whole specular integrand."""
+        """Mean radiance weighted by the whole specular integrand, (m, 3)."""
         m = self.sampled.metal[:, None]
         R, E = self.reflected((1 - m) * self.sampled.f0 + m * self.sampled.color)
         return R / np.maximum(E, 1e-12)
@@ -149,15 +152,17 @@ class PointIntegrals:
 
     @cached_property
     def right(self) -> np.ndarray:
-        """The reference: `reference()` with exact Fresnel terms and multiple scattering."""
+        """The reference: the value of `reference()` with exact Fresnel terms and multiple scattering, (m, 3)."""
         return self.reference()
 
     def reference(self, *, exact: bool = True, again: bool = True) -> np.ndarray:
-        """(m, 3) radiance of glTF's model: a specular term over a Lambertian one, which gets the light that the
-        specular term leaves, as in `side_by_side.Material`.
+        """Return the radiance of glTF's reflection model, (m, 3).
 
-        exact: use Fresnel's equations for the insulators, else Schlick's term. again: include multiple scattering
-        between facets [Turquin2019].
+        The model is a specular term over a Lambertian one, which gets the light that the specular term leaves, as in
+        `side_by_side.Material`.
+
+        exact: True uses Fresnel's equations for insulators, False Schlick's term. again: True includes multiple
+        scattering between facets [Turquin2019].
         """
         s = self.sampled
         lost = self._lost if again else 0.0
@@ -190,7 +195,9 @@ class PointIntegrals:
     # ------------------------------------------------------------------------------------------- other models
 
     def masked(self, masking: str) -> np.ndarray:
-        """(m, 3): the change of the specular part, scattered once, under another masking term than Smith's."""
+        """Return the change of the singly scattered specular part under the masking `masking` instead of Smith's,
+        (m, 3).
+        """
         s = self.sampled
         made = np.empty((len(s.roughness), 2, 3))
         for g in self.groups:
@@ -205,10 +212,10 @@ class PointIntegrals:
         return np.asarray(made[:, 0] + F0 * (made[:, 1] - made[:, 0]) - R)
 
     def grooved(self) -> np.ndarray:
-        """(m, 3): the change of the diffuse part under Oren and Nayar's model in place of Lambert's.
+        """Return the change of the diffuse part under Oren and Nayar's model instead of Lambert's, (m, 3).
 
-        Grooves get the slopes of Beckmann's distribution of the same α: their mean square is α²/2, so tan σ = α/√2.
-        The model is a ρ + b ρ² in its albedo ρ, so two albedos determine it.
+        The grooves have the slopes of Beckmann's distribution of the same α: their mean square is α²/2, so tan σ =
+        α/√2. The model is a ρ + b ρ² in its albedo ρ, so two albedos determine a and b.
         """
         s = self.sampled
         rho = np.array([0.5, 1.0])
@@ -232,9 +239,9 @@ class PointIntegrals:
         return out
 
     def sheen(self) -> np.ndarray | None:
-        """(m, 3): the error that the split sum of Charlie's lobe makes on the materials that have a sheen.
+        """Return the error that the split sum of Charlie's lobe makes on the materials that have a sheen, (m, 3).
 
-        None where no point has one.
+        None where no point has a sheen.
         """
         some = [k for k in range(len(self.scene.materials)) if self.scene.materials[k]["sheen_color"].most > 0]
         out = np.zeros_like(self.sampled.color)
@@ -255,7 +262,7 @@ class PointIntegrals:
 
 
 def mirrored(points: Points) -> np.ndarray:
-    """(3, m) mirror directions of the views of points (3, m)."""
+    """Return the mirror directions (3, m) of the views of points."""
     return np.asarray(2 * (points.n * points.v).sum(0) * points.n - points.v)
 
 

@@ -61,9 +61,9 @@ smooth lobes are a rim at the horizon, hard panels do not reach 1e-3 on any grid
 
 
 def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
-    """The built-in environment: sky, ground, and a sun of more than 1e5 times the mean radiance, made by a kernel.
+    """Make the built-in environment: sky, ground, and a sun of more than 1e5 times the mean radiance.
 
-    height: rows of the lat-long.
+    height: rows of the lat-long. Raises DeviceError.
     """
     program = device.build(source.demo().text, {"W": 1, "T": 1, "PRECISION": 32})
     # At the centre of a texel, so that the disc covers one whole and the maximum is the sun's own radiance.
@@ -90,13 +90,17 @@ def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
 
 @dataclass(frozen=True)
 class Baked:
-    """What a bake did or would do for one environment.
+    """The result of baking one environment, or the prediction of it in a dry run.
 
-    name: of its outputs. state: "done", "skipped" or "planned". files: paths, and nbytes: bytes of the arrays of each
-    before compression. manifest: of a planned one its key and its recipe alone. plan: each distinct level, with the
-    engines that it is for. levels: rows of the manifest with the seconds that each took. as_read: errors after the
-    engine's sampling (`reading.AsRead.data`); of a planned one, those of chains that could be had too. programs: the
-    kernel programs that a planned one compiles to.
+    name       stem of the output files
+    state      "done", "skipped" or "planned"
+    files      paths of the files
+    nbytes     for each file, bytes of its arrays before compression
+    manifest   the manifest; of a planned bake only its key and its recipe
+    plan       each distinct level, with the engines that it is for
+    levels     rows of the manifest, with the seconds that each level took
+    as_read    errors after the engine's sampling (`reading.AsRead.data`); a planned bake also has alternative chains
+    programs   kernel programs that a planned bake compiles
     """
 
     name: str
@@ -116,8 +120,11 @@ class Baked:
 class BakePlan:
     """A validated bake of several environments.
 
-    names, sources: name of the outputs of each environment, and the environment. engines, chains: the target engines,
-    and the chain of each. The rest are options of `bake`.
+    names    stem of the outputs of each environment
+    sources  the environments
+    engines  the target engines
+    chains   the chain of each engine
+    The other fields are options of `bake`.
     """
 
     names: tuple[str, ...]
@@ -135,14 +142,14 @@ class BakePlan:
 
     @property
     def recipe(self) -> Chain:
-        """The first chain, for what all chains have in common: NDF, tolerance, certificates."""
+        """The first chain. Its NDF, tolerance and certificates are those of all chains."""
         return self.chains[0]
 
 
 def plan(request: BakeRequest) -> BakePlan:
     """Check every option of a request and find the chain of each engine.
 
-    Nothing is read but descriptions of engines and NDFs. Raises UsageError, UnsupportedError, FileError, InputError.
+    Only descriptions of engines and NDFs are read. Raises UsageError, UnsupportedError, FileError and InputError.
     """
     if not request.sources:
         raise UsageError("no environment was given")
@@ -181,9 +188,9 @@ def plan(request: BakeRequest) -> BakePlan:
 
 
 def name_of(item: Any) -> str:
-    """The name of the outputs of a source: a path's stem, "demo", "array", or an environment's own name.
+    """Return the stem of the outputs of a source: a path's stem, "demo", "array", or an environment's own name.
 
-    Raises UsageError for an object that is no source and for a name that cannot be a file's.
+    Raises UsageError for an object that is not a source and for a name that cannot be a file name.
     """
     if isinstance(item, Environment):
         name = item.name
@@ -327,7 +334,7 @@ def bake_one(
     dry_run: bool = False,
     progress: Callable[[str, str, float], None] | None = None,
 ) -> Baked:
-    """Bake the k-th environment of a plan. Raises what `bake` raises."""
+    """Bake the k-th environment of a plan, k from 0. Raises the errors of `bake`."""
     found = read(request, k, device, dry_run=dry_run)
     if isinstance(found, Baked):
         return found
@@ -340,10 +347,13 @@ def bake_one(
 
 @dataclass(frozen=True)
 class Loaded:
-    """An environment that was read and is to be baked. It holds the lock of its output until `write` or `abandon`.
+    """An environment that was read and will be baked. It holds the lock of its output until `write` or `abandon`.
 
-    recipe, key: what decides the bytes of the output, and their hash. there: the manifest that is replaced.
-    planned: levels, each with the engines it is for. made: folders that were made for the output.
+    recipe   the data that decide the bytes of the output
+    key      hash of the recipe, the source and the version
+    there    the manifest that is replaced, or None
+    planned  levels, each with the engines that it is for
+    made     folders that were created for the output
     """
 
     request: BakePlan
@@ -361,17 +371,20 @@ class Loaded:
 
     @property
     def output(self) -> FolderOutput:
-        """The files that it becomes."""
+        """The output folder with its manifest."""
         return _output(self.request, self.k)
 
 
 @dataclass(frozen=True)
 class Computed:
-    """What the device made of an environment, to be encoded and written.
+    """The device's results for an environment, before they are encoded and written.
 
-    of: for each engine, the places of its own chain and of Charlie's in `lit.chains`. table, splits: the (scale, bias)
-    table, and each engine's own. window: the windowed harmonics. written, as_read: its files, and errors after the
-    engine's sampling, where these were measured.
+    of       for each engine, the indices of its own chain and of Charlie's in `lit.chains`
+    table    the (scale, bias) table
+    splits   the split-sum table of each engine
+    window   the windowed harmonics
+    written  the encoded files, where errors after the engine's sampling were measured
+    as_read  those errors
     """
 
     loaded: Loaded
@@ -386,7 +399,7 @@ class Computed:
 
 
 def manifest_path(request: BakePlan, k: int) -> Path:
-    """Path of the manifest of the k-th environment."""
+    """Return the path of the manifest of the k-th environment."""
     return request.output / f"{request.names[k]}.json"
 
 
@@ -395,10 +408,10 @@ def _output(request: BakePlan, k: int) -> FolderOutput:
 
 
 def status(request: BakePlan, k: int) -> Baked:
-    """Say whether the k-th environment is up to date, from the bytes of its source and outputs; nothing is decoded.
+    """Return whether the k-th environment is up to date, from the bytes of its source and outputs; nothing is decoded.
 
-    Returns a Baked in the state "skipped" or, without a plan, "planned". Raises FileError for a file that cannot be
-    read or is not ours.
+    The result is a `Baked` in the state "skipped", or in the state "planned" without a plan. Raises FileError for a
+    file that cannot be read or is not ours.
     """
     with system_errors(request.output):
         name, output = request.names[k], _output(request, k)
@@ -445,11 +458,11 @@ def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: 
 
 
 def read(request: BakePlan, k: int, device: Device | str | None = None, *, dry_run: bool = False) -> Baked | Loaded:
-    """Read the k-th environment of a plan and take the lock of its output, waiting where another run has it.
+    """Read the k-th environment of a plan and take the lock of its output, waiting while another run holds it.
 
-    device: used for the built-in environment and for a plan alone.
-    Returns a Baked where there is nothing to do, or where `dry_run` asks what would be done.
-    Raises FileError, InputError.
+    device: used for the built-in environment and in a dry run. dry_run: return the plan instead of reading.
+    Returns a `Baked` where there is nothing to do or in a dry run, otherwise a `Loaded`. Raises FileError and
+    InputError.
     """
     with system_errors(request.output):
         begin = time.perf_counter()
@@ -545,7 +558,7 @@ def _give_up(lock: Lock | None, made: Sequence[Path]) -> None:
 
 
 def abandon(found: Loaded | Computed, *, folders: bool = False) -> None:
-    """Release the lock of an environment that will not be written; with `folders`, remove those made for it."""
+    """Release the lock of an environment that will not be written; with `folders`, remove the folders made for it."""
     loaded = found.loaded if isinstance(found, Computed) else found
     _give_up(loaded.lock, loaded.made if folders else ())
 
@@ -652,7 +665,7 @@ def _write(made: Computed) -> Baked:
 
 
 def targets_of(request: BakePlan, name: str) -> list[Target]:
-    """The planned files of every engine, for an environment of that name."""
+    """Return the planned files of every engine for an environment called `name`."""
     return [
         target
         for engine, recipe in zip(request.engines, request.chains, strict=True)
@@ -742,7 +755,10 @@ def _programs(request: BakePlan, env: Environment) -> tuple[Program, ...]:
 
 
 def planned_levels(request: BakePlan, texel: float) -> tuple[tuple[tuple[str, ...], LevelPlan], ...]:
-    """Each distinct level of the engines' chains, with their names."""
+    """Return each distinct level of the engines' chains, with the names of its engines.
+
+    texel: angle of the source's texels in radians.
+    """
     rows: list[tuple[list[str], LevelPlan]] = []
     for engine, recipe in zip(request.engines, request.chains, strict=True):
         if not engine.needs("specular"):
@@ -790,7 +806,7 @@ FORMAT_LOSS = 0.05
 
 
 def format_notices(manifest: Mapping[str, Any]) -> list[str]:
-    """Notices of what pixel formats lose: clipped values, windowed harmonics, large errors."""
+    """Return sentences about losses by pixel formats: clipped values, windowed harmonics, large errors."""
     found = []
     for name, entry in manifest["files"].items():
         if entry.get("clipped"):
@@ -857,7 +873,7 @@ def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str,
 
 @dataclass(frozen=True)
 class EntryKey:
-    """An NDF as the key of what a bake keeps between images: one entry itself, not another of the same name."""
+    """An NDF as a dictionary key. Two keys are equal only for the same entry, not for two entries of the same name."""
 
     identity: int
     given: tuple[tuple[str, Any], ...]

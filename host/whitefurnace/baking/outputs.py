@@ -1,4 +1,4 @@
-"""The files of a bake: for each engine what is written where, and what its format costs."""
+"""Plans and encodes the files of a bake for each engine, and measures the error of their pixel formats."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ from whitefurnace.version import VERSION
 class Target:
     """One file that a bake writes.
 
-    path: where it is written. engine: name of the engine that loads it. nbytes: bytes of its arrays before compression.
+    path    where it is written
+    engine  name of the engine that loads it
+    nbytes  bytes of its arrays before compression
     """
 
     path: Path
@@ -62,8 +64,9 @@ class Target:
 class Encoded(Target):
     """A file of a bake, ready to be written.
 
-    write: stages the file in a transaction. stated: what the manifest says of it.
-    levels: of a specular chain, what a GPU reads of each level, (6, s, s, 3) in this project's directions.
+    write   stages the file in a transaction
+    stated  facts about the file for the manifest
+    levels  for a specular chain, each level as a GPU reads it, (6, s, s, 3) in this project's directions
     """
 
     write: Callable[[Transaction], object]
@@ -73,11 +76,14 @@ class Encoded(Target):
 
 @dataclass(frozen=True)
 class Made:
-    """What a bake made for one engine.
+    """The results of a bake for one engine.
 
-    chain, sheen: its specular chain, and Charlie's where it has sheen. table: the (scale, bias) table of `raw` and
-    `exr`. split: the engine's own table, where it has one. window: the windowed harmonics. provenance: version, key,
-    source and recipe, as texts.
+    chain       its specular chain
+    sheen       Charlie's chain, where the engine has sheen
+    table       the (scale, bias) table of `raw` and `exr`
+    split       the engine's own split-sum table, where it has one
+    window      the windowed harmonics
+    provenance  version, key, source and recipe, as texts
     """
 
     lit: Lighting
@@ -91,10 +97,11 @@ class Made:
 
 @dataclass(frozen=True)
 class Writer:
-    """How the files that hold one thing are made.
+    """The functions that plan and encode the files with one kind of content.
 
-    planned_size: bytes of the file's arrays, before anything is computed. Raises UsageError for what cannot be made.
-    encode: the file at a path, from what the bake made.
+    planned_size  returns the bytes of a file's arrays before anything is computed; raises UsageError for a file that
+                  cannot be made
+    encode        returns the encoded file at a path, from the results of the bake
     """
 
     planned_size: Callable[[Engine, Chain, File], int]
@@ -103,14 +110,14 @@ class Writer:
 
 @dataclass(frozen=True)
 class Container:
-    """How everything that a bake makes is written for `raw` or `exr`; as `Writer`, for all files at once."""
+    """The functions that plan and encode all files of `raw` or `exr` at once; see `Writer`."""
 
     planned: Callable[[Engine, Chain, Path, str], list[Target]]
     encode: Callable[[Engine, Chain, Path, str, Made], list[Encoded]]
 
 
 def targets(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Target]:
-    """The files of an engine under `folder`/ENGINE, planned. Raises UsageError for what cannot be made."""
+    """Plan the files of an engine under `folder`/ENGINE. Raises UsageError for a file that cannot be made."""
     if engine.container != "files":
         return CONTAINERS[engine.container].planned(engine, chain, folder, stem)
     found = [
@@ -121,7 +128,7 @@ def targets(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Targe
 
 
 def encoded(engine: Engine, chain: Chain, folder: Path, stem: str, made: Made) -> list[Encoded]:
-    """The files that `targets` plans, encoded from what a bake made."""
+    """Encode the files that `targets` plans, from the results `made` of a bake."""
     if engine.container != "files":
         return CONTAINERS[engine.container].encode(engine, chain, folder, stem, made)
     found = [WRITERS[file.holds].encode(engine, _path(engine, folder, stem, file), file, made) for file in engine.file]

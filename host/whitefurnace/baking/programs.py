@@ -1,4 +1,4 @@
-"""The kernel programs that a bake compiles to: the models of its recipe and nothing else, each with its text."""
+"""Lists the kernel programs that a bake compiles, with their texts. They hold only the models of its recipe."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ LEAST_TERMS = 16
 class Program:
     """A kernel program of a bake.
 
-    name: what it is for. when: what of the image or of the device decides that it is built; empty where it always is.
+    name  its purpose
+    when  the condition on the image or the device under which it is built; empty where it is always built
     """
 
     name: str
@@ -31,7 +32,7 @@ class Program:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its text."""
+        """Bytes of the program's text."""
         return len(self.source.text.encode())
 
     def data(self) -> dict[str, Any]:
@@ -50,10 +51,10 @@ class Program:
 def programs(
     chains: Sequence[Chain], kind: str, texel: float, *, demo: bool = False, charlie: bool = False
 ) -> tuple[Program, ...]:
-    """The programs that a bake builds, the table of split sums included; equal texts once.
+    """Return the programs that a bake builds, with those of the split-sum table; equal texts appear once.
 
-    chains: of the engines. kind: "latlong" or "cube". texel: width of a source texel in radians. demo: whether the
-    built-in environment is made. charlie: whether a table has Charlie's albedo.
+    chains: chains of the engines. kind: "latlong" or "cube". texel: width of a source texel in radians. demo: True if
+    the built-in environment is made. charlie: True if a table has Charlie's albedo.
     """
     found: dict[str, Program] = {}
     for one in _programs(chains, kind, texel, demo, charlie):

@@ -1,4 +1,4 @@
-"""What a caller asks of a bake, before anything of it is checked."""
+"""The options of a bake as a caller gives them, before they are checked."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class BakeRequest:
-    """Every option of a bake, with its default; `whitefurnace.bake` says what each means.
+    """Every option of a bake with its default; `whitefurnace.bake` documents them.
 
-    `size`, `min_size`, `levels` and `table` are the engine's own where they are None.
+    Where `size`, `min_size`, `levels` or `table` is None, the engine's own value is used.
     """
 
     sources: Sequence[Source]

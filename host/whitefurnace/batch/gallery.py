@@ -1,4 +1,4 @@
-"""Writes the results of a batch as one HTML page: a row for each environment, with a thumbnail and the stated errors.
+"""Writes the results of a batch as an HTML page: a row for each environment, with thumbnails and the stated errors.
 
 The page opens from disk, loads nothing from a network, and has the same bytes for the same results.
 """

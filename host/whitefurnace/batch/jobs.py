@@ -682,7 +682,9 @@ def _table_plan(recipe: str, kind: str, output: str, force: bool) -> tables.Tabl
 
 @dataclass(frozen=True)
 class Prepared:
-    """An item after reading. `loaded` is None where the device makes everything (demo, tables)."""
+    """An item after reading. `loaded` is None where there is nothing to read: for the built-in environment and for
+    tables.
+    """
 
     item: Item
     loaded: baking.Loaded | None
@@ -778,7 +780,7 @@ def abandon(found: Prepared | Computed) -> None:
 
 
 def do(item: Item) -> Result:
-    """Run one item from end to end. A failure is returned as a result and not raised."""
+    """Read, compute and write one item. A failure is returned as a result and not raised."""
     found: Prepared | Computed | Result = prepare(item)
     if isinstance(found, Prepared):
         found = compute(found)
@@ -973,7 +975,9 @@ def _on_one_device(items: Iterable[Item]) -> Iterator[Item]:
 
 
 class Summary:
-    """Running totals of a batch: counts of results, sums of times and sizes, and the failures. Time starts now."""
+    """Running totals of a batch: counts of results, sums of times and sizes, and the failures. Its clock starts at
+    once.
+    """
 
     def __init__(self, total: int) -> None:
         self.total, self.begin = total, time.perf_counter()

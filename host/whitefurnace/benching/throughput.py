@@ -1,6 +1,8 @@
-"""Measures the throughput of every kernel, and its ratio to the multiply-adds and the memory bandwidth of the same
-device. These yardsticks run next to each case, since absolute figures of a shared machine vary by a factor of 2 to 4
-within the hour."""
+"""Measures the throughput of every kernel, and its ratio to the multiply-adds and memory bandwidth of the same device.
+
+These limits are measured right before and after each case, since the absolute speed of a shared machine varies by a
+factor of 2 to 4 within an hour.
+"""
 
 from __future__ import annotations
 
@@ -107,7 +109,7 @@ class Spread:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Spread:
-        """The spread of the values of several runs."""
+        """Return the spread of the values of several runs."""
         return cls(statistics.median(values), min(values), max(values))
 
 
@@ -115,9 +117,9 @@ class Spread:
 class Work:
     """The work of one run.
 
-    run     launches it, with the result of `before`, which is not timed
-    units   of work, in the case's unit
-    nbytes  bytes of its arrays, each read or written once
+    run     launches the work; it gets the result of `before`, which is not timed
+    units   amount of work, in the unit of the case
+    nbytes  bytes of its arrays, if each is read or written once
     """
 
     run: Callable[[Any], object]
@@ -130,11 +132,11 @@ class Work:
 class Case:
     """A kernel to measure.
 
-    kernel      its file
-    unit        in which its work is counted
+    kernel      name of its file
+    unit        unit in which its work is counted
     about       one line for users
-    make        gives its work on a device, in a precision, `scale` times the smallest
-    precisions  in bits
+    make        returns its work on a device in a precision, `scale` times the smallest
+    precisions  precisions in bits
     """
 
     name: str
@@ -149,10 +151,12 @@ class Case:
 class Throughput:
     """The result of a case.
 
-    rate       units a second
-    gflops     GFLOP/s of the median run, None where operations are not counted; `gbytes`: GB/s
-    of_peak    median ratio to the multiply-adds of the same device, `of_memory` to its bandwidth
-    seconds    of a run on the device
+    rate       units of work per second
+    gflops     GFLOP/s of the median run, None where operations are not counted
+    gbytes     GB/s of the median run
+    of_peak    median ratio to the multiply-adds of the same device
+    of_memory  median ratio to its memory bandwidth
+    seconds    seconds of a run on the device
     """
 
     case: str
@@ -210,7 +214,7 @@ def _enough(device: Device, make: Callable[[int], Work], least: float) -> Work:
 
 
 class BenchMeter:
-    """Measures the yardsticks of a device. Each call is one run; `yardstick` has the results of all."""
+    """Measures the limits of a device. Each call is one run; `yardstick` returns the results of all runs."""
 
     def __init__(self, device: Device, least: float = LEAST_SECONDS, nbytes: int = STREAM_BYTES) -> None:
         self.device, self.least = device, least
@@ -231,15 +235,18 @@ class BenchMeter:
         return rate
 
     def peak(self, precision: int) -> float:
-        """GFLOP/s of multiply-adds on all cores, in one run."""
+        """Measure the GFLOP/s of multiply-adds on all cores, in one run.
+
+        precision: 32 or 64 bits.
+        """
         return self._run(precision, lambda: self._multiply_adds(precision))
 
     def read(self) -> float:
-        """GB/s of reading memory, in one run."""
+        """Measure the GB/s of reading memory, in one run."""
         return self._run("read", lambda: self._streams()[0])
 
     def triad(self) -> float:
-        """GB/s of a + x·b, two arrays read and one written, in one run."""
+        """Measure the GB/s of a + x·b, which reads two arrays and writes one, in one run."""
         return self._run("triad", lambda: self._streams()[1])
 
     def _multiply_adds(self, precision: int) -> Work:
@@ -281,7 +288,7 @@ class BenchMeter:
         )
 
     def yardstick(self) -> Yardstick:
-        """The limits measured so far; those that were not are measured in RUNS runs now."""
+        """Return the limits of the device; those that were not measured yet are measured now in RUNS runs."""
         measures: dict[str | int, Callable[[], float]] = {p: partial(self.peak, p) for p in self.precisions}
         for which, measure in {**measures, "read": self.read, "triad": self.triad}.items():
             while len(self._rates.get(which, [])) < RUNS:
@@ -748,8 +755,10 @@ CASES = (
 
 
 def cases(names: Sequence[str]) -> tuple[Case, ...]:
-    """The cases of these names in their order, all cases where there are no names. Raises UsageError with the nearest
-    name."""
+    """Return the cases with these names in the order given, or all cases where no name is given.
+
+    Raises UsageError with the nearest name.
+    """
     known = {case.name: case for case in CASES}
     for name in names:
         if name == "tradeoff":
@@ -766,9 +775,9 @@ def throughput(
     runs: int = RUNS,
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Throughput]:
-    """Measure cases one after the other, in every precision of the device, each with its yardstick next to it.
+    """Measure cases one after the other, in every precision of the device, with the limits of the device next to each.
 
-    runs: counted runs of a case. progress: called with the case and the share done.
+    runs: number of timed runs of a case. progress: called with the case and the share of the work done.
     """
     todo = [(case, precision) for case in wanted for precision in case.precisions if precision in meter.precisions]
     for k, (case, precision) in enumerate(todo):

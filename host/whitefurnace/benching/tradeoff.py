@@ -1,5 +1,7 @@
-"""Measures error against time of the prefilter: every method and quality on an environment, its Pareto front, and how
-the time depends on the size of the output, on the size of the source and on α."""
+"""Measures the error of the prefilter against its time, for every method and quality on an environment.
+
+It marks the Pareto front, and measures how the time depends on the output size, the source size and α.
+"""
 
 from __future__ import annotations
 
@@ -41,12 +43,16 @@ LEVEL = 64
 
 @dataclass(frozen=True)
 class Point:
-    """A chain by one method at one setting.
+    """A chain that was made by one method at one setting.
 
-    seconds              from texels in memory to finished levels, without the `certificate`
-    error, worst, rmse   stated errors of its worst level
-    evaluations          lobe evaluations; `rules`: the method of each level
-    front                True if no other point is both faster and more accurate
+    method              "tolerance" or "samples"; `setting` is its value
+    seconds             seconds from texels in memory to finished levels, without the certificate
+    certificate         seconds of the certificate
+    error, worst, rmse  stated errors of the worst level
+    evaluations         number of lobe evaluations
+    rules               method of each level
+    runs                number of runs that were timed
+    front               True if no other point is both faster and more accurate
     """
 
     environment: str
@@ -73,7 +79,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Missed:
-    """A point or a cost that could not be made, and why. For a cost, `method` is the quantity that varies."""
+    """A point or a cost that could not be measured, with the reason. For a cost, `method` is the quantity that
+    varies.
+    """
 
     environment: str
     method: str
@@ -83,10 +91,10 @@ class Missed:
 
 @dataclass(frozen=True)
 class Cost:
-    """Seconds at COST_TOLERANCE as one quantity varies.
+    """Seconds at COST_TOLERANCE for one value of a quantity that varies.
 
     over   "output size" (face edge of level 0), "source rows" (of a lat-long) or "alpha" (one level of LEVEL² texels)
-    value  of that quantity
+    value  value of that quantity
     """
 
     environment: str
@@ -97,7 +105,7 @@ class Cost:
 
 
 def front(points: Sequence[tuple[float, float]]) -> list[int]:
-    """Indices of the Pareto front of (cost, error), cheapest first.
+    """Return the indices of the Pareto front of (cost, error) pairs, cheapest first.
 
     A point is on the front if no other is better in one of the two without being worse in the other. Of equal points
     the first counts; NaN is on no front.
@@ -112,14 +120,14 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 
 def load(source: str, device: Device) -> Environment:
-    """An environment in memory, from a path or the word `demo`."""
+    """Read an environment into memory, from a path or the word `demo`. Raises the errors of `environment`."""
     if source == DEMO and not os.path.exists(source):
         return replace(demo(device), name=DEMO)
     return environment(source)
 
 
 def check(size: int, min_size: int) -> None:
-    """Check the sizes of a chain. Raises UsageError."""
+    """Check the sizes of a chain in texels, which must be powers of two. Raises UsageError."""
     chain(size=size, min_size=min_size)
 
 
@@ -154,7 +162,7 @@ def _prefilter(
 
 
 def methods() -> list[tuple[str, float]]:
-    """(method, setting) of every point."""
+    """Return the (method, setting) of every point: each of TOLERANCES and of SAMPLES."""
     return [*(("tolerance", x) for x in TOLERANCES), *(("samples", n) for n in SAMPLES)]
 
 
@@ -171,8 +179,9 @@ def points(
 ) -> Iterator[Point | Missed]:
     """Measure every method and setting on one environment; those that cannot be made are `Missed`.
 
-    size, min_size: of the chain. runs, budget: most runs and seconds of a point. todo: (method, setting) pairs, by
-    default `methods()`.
+    size, min_size: face edges of the first and last level in texels. runs: largest number of runs of a point. budget:
+    seconds after which a point gets no further run. todo: (method, setting) pairs, by default `methods()`. progress:
+    called with a setting and the share of the work done.
     """
     todo = methods() if todo is None else todo
     for k, (method, setting) in enumerate(todo):
@@ -210,7 +219,7 @@ def points(
 
 
 def with_front(measured: Sequence[Point]) -> list[Point]:
-    """The points of one environment, with those on the Pareto front marked."""
+    """Return the points of one environment with `front` set for those on the Pareto front."""
     best = set(front([(p.seconds.median, p.error) for p in measured]))
     return [replace(p, front=k in best) for k, p in enumerate(measured)]
 
@@ -238,7 +247,7 @@ def _level(env: Environment, device: Device, size: int, alpha: float, tolerance:
 
 
 def resampled(env: Environment, device: Device, rows: int) -> Environment:
-    """The same light as a lat-long of `rows` rows, each texel the exact mean over its solid angle."""
+    """Return the same light as a lat-long of `rows` rows, where each texel is the exact mean over its solid angle."""
     return replace(environment(Means(device, env.texels, env.rotation).level(Shape(True, rows))), name=env.name)
 
 
@@ -255,7 +264,11 @@ def costs(
     alphas: Sequence[float] = ALPHAS,
     progress: Callable[[str, float], None] | None = None,
 ) -> Iterator[Cost | Missed]:
-    """Measure the seconds of a chain over output sizes and source rows, and of a level over α, at COST_TOLERANCE."""
+    """Measure the seconds of a chain over output sizes and source rows, and of a level over α, at COST_TOLERANCE.
+
+    sizes: face edges in texels. rows: rows of a lat-long source. alphas: α of the level. The other parameters are those
+    of `points`.
+    """
 
     def whole(some: Environment, size: int) -> float:
         return _prefilter(some, device, size, min(min_size, size), tolerance=COST_TOLERANCE, certify=0)[1]

@@ -18,7 +18,7 @@ from whitefurnace.errors import UsageError, nearest
 
 @dataclass(frozen=True)
 class Chosen:
-    """A model and the parameters given with it. The others follow from roughness or have defaults."""
+    """A model and the parameters given with it. Its other parameters follow from roughness or have defaults."""
 
     model: Model
     given: Mapping[str, float | tuple[float, ...]]

@@ -15,9 +15,11 @@ from whitefurnace.errors import UsageError
 class Parameter:
     """One parameter of a model.
 
-    name, symbol, unit: as command lines, formulas and tables write it. low, high: its domain, inclusive, which input is
-    held to. typical: values that tests and help show. about: what it is, in one line. default: its value where none is
-    given; None where one must be given or follows from roughness.
+    name, symbol, unit  as command lines, formulas and tables write it
+    low, high           its domain, inclusive; input outside it is refused
+    typical             values that tests and help show
+    about               its meaning in one line
+    default             its value where none is given; None where one must be given or follows from roughness
     """
 
     name: str
@@ -32,7 +34,8 @@ class Parameter:
     def check(self, values: Any, where: str) -> np.ndarray:
         """Return `values` as float64.
 
-        Raises UsageError where one is no number, is not finite or lies outside [low, high]; `where` begins the message.
+        where: begins the error message. Raises UsageError for a value that is not a number, is not finite or lies
+        outside [low, high].
         """
         try:
             array = np.asarray(values, np.float64)
@@ -56,19 +59,18 @@ class Paper:
 
 @dataclass(frozen=True)
 class Checks:
-    """What an entry states for the engine and the tests to act on. None means that nothing is stated.
+    """Facts of an entry that the engine and the tests act on. None means that nothing is stated.
 
-    normalized: whether ∫ D(m)(n·m) dω is 1.
-    reciprocal: whether the model stays the same when l and v are exchanged. `reciprocal_at` has the parameter values
-      with which it does where it does not otherwise.
-    slow_rules: by how many times its change from the rule before a quadrature rule may err; over 1 where the integrand
-      has kinks or roots that rules resolve slowly.
+    normalized: True if ∫ D(m)(n·m) dω is 1.
+    reciprocal: True if the model stays the same when l and v are exchanged.
+    slow_rules: largest ratio of a quadrature rule's error to its change from the rule before; over 1 where the
+    integrand has kinks or roots that rules resolve slowly.
     weak_furnace: value of the weak furnace test with every NDF, for a masking.
     tolerance: tolerances (float32, float64) of single checks of `whitefurnace verify`, by the name of the check.
-    largest_albedo: the largest directional albedo for parameters in their domain, infinity for no bound.
-    float32_error: the largest relative error of D in float32 where D is over 1e-7 of its peak.
-    negative: whether the BRDF has negative values somewhere.
-    leaves_unit_range: whether the Fresnel term leaves [0, 1] somewhere.
+    largest_albedo: largest directional albedo for parameters in their domain, infinity for no bound.
+    float32_error: largest relative error of D in float32 where D is over 1e-7 of its peak.
+    negative: True if the BRDF has negative values somewhere.
+    leaves_unit_range: True if the Fresnel term leaves [0, 1] somewhere.
     """
 
     normalized: bool | None = None
@@ -141,12 +143,12 @@ class Model:
 
     @property
     def kernel_file(self) -> str:
-        """The kernel file of a model of the catalogue, relative to the folder of kernels."""
+        """Path of the kernel file of a catalogue model, relative to the folder of kernels."""
         return f"{self.slot}/{self.name}.clh"
 
     @property
     def facts(self) -> dict[str, Any]:
-        """What the entry states, for listings: its notes, and those of its checks that `_LISTED` names."""
+        """Return the facts of the entry for listings: its notes, and the values of its checks that `_LISTED` names."""
         after: dict[str | None, dict[str, Any]] = {}
         for name, places in _LISTED.items():
             value = getattr(self.checks, name.replace(" ", "_"))
@@ -159,13 +161,15 @@ class Model:
 
     @property
     def arguments(self) -> tuple[str, ...]:
-        """Names of the numbers that a kernel function takes after its own: parameters, then constants."""
+        """Names of the numbers that a kernel function takes after its own parameters: the model's parameters, then
+        its constants.
+        """
         return (*(p.name for p in self.parameters), *self.constant_names)
 
     def passed(self, function: str) -> tuple[str, ...]:
         """Return those of `arguments` that a kernel function of a self-contained model takes.
 
-        Constants go to D, its sampler and the diffuse f alone, and functions of a user's file take none.
+        Only D, its sampler and the diffuse f take the constants; functions of a user's file take none.
         """
         wanted = self.text is None and function in ("NDF_D", "NDF_SAMPLE", "DIFFUSE_F")
         return self.arguments if wanted else tuple(p.name for p in self.parameters)
@@ -175,8 +179,11 @@ class Model:
 class Integral:
     """An integral of the catalogue, whose integrand is the kernel file `integrand/NAME.clh`.
 
-    components: numbers of its value. needs: the model functions that it calls. support: the rule that it is summed by,
-    a macro of `ring.clh`. view: whether it depends on the view. about: its formula, for help texts.
+    components  number of components of its value
+    needs       model functions that it calls
+    support     rule by which it is summed, a macro of `ring.clh`
+    view        True if it depends on the view direction
+    about       its formula, for help texts
     """
 
     name: str

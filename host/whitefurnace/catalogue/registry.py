@@ -1,4 +1,4 @@
-"""Finds the entries in their folders and gives them by name; lists the integrals."""
+"""Finds the catalogue entries in their folders and returns them by name; lists the integrals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quadrature rules: Gauss nodes on [0, 1], and the ladders of product rules that integrals climb."""
+"""Quadrature rules: Gauss nodes on [0, 1], and the sequences of finer and finer product rules that integrals use."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
 class Rule:
     """A product of Gauss rules over the polar angle and the azimuth.
 
-    family: the ladder that it belongs to. near, far: nodes in the two polar panels, 0 near where there is one panel.
-    azimuths: nodes in each of `panels` azimuth panels. For `light-angles` the panels are polar, and the azimuths are
-    the midpoints of a quarter turn.
+    family: key of the sequence of rules that it belongs to. near, far: number of nodes in the two polar panels; near is
+    0 where there is one panel. azimuths: number of nodes in each of `panels` azimuth panels. For `light-angles` the
+    panels are polar, and the azimuths are the midpoints of a quarter turn.
     """
 
     family: str
@@ -32,18 +32,18 @@ class Rule:
 
     @property
     def name(self) -> str:
-        """The name of the rule, as results state it: `gauss-16+32x12`."""
+        """Name of the rule as results state it, such as `gauss-16+32x12`."""
         polar = f"{self.near}+{self.far}" if self.near else f"{self.far}"
         return f"{self.family}-{polar}x{self.azimuths if self.panels == 1 else f'{self.panels}*{self.azimuths}'}"
 
     @property
     def evaluations(self) -> int:
-        """Evaluations of the integrand for one cell."""
+        """Number of evaluations of the integrand for one cell."""
         return (self.near + self.far) * self.azimuths * self.panels
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Numbers of polar nodes as kernels take them: those of the first panel where there are two, then all."""
+        """Numbers of polar nodes as kernels take them: of the first panel where there are two, then of all."""
         return (self.near, self.near + self.far) if self.near else (self.far,)
 
     def tables(self) -> tuple[np.ndarray, np.ndarray]:

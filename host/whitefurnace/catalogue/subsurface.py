@@ -1,6 +1,6 @@
-"""Light under a surface: published media, the reflectance of a half-space, and how far light goes before it leaves.
+"""Light under a surface: measured media, the reflectance of a half-space, and how far light travels before it leaves.
 
-Lengths are in millimetres and coefficients per millimetre, as the papers have them.
+Lengths are in millimetres and coefficients per millimetre, as in the papers.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ SKIN = (
 
 
 def diffuse_reflectance(scattering: Any, absorption: Any, ior: float) -> np.ndarray:
-    """Return the diffuse reflectance of a half-space, by the integral of the dipole.
+    """Return the diffuse reflectance of a half-space in [0, 1], by the integral of the dipole.
 
-    scattering, absorption: reduced scattering and absorption, in any one unit of 1/length, ≥ 0. ior: index of
-    refraction. It is ½ α' (1 + e^(-4/3 A √(3(1 - α')))) e^(-√(3(1 - α'))), A = (1 + F_dr)/(1 - F_dr). [Jensen2001,
-    after eq. 4]
+    scattering, absorption: reduced scattering and absorption, ≥ 0, both in the same unit of 1/length. ior: index of
+    refraction. The value is ½ α' (1 + e^(-4/3 A √(3(1 - α')))) e^(-√(3(1 - α'))), A = (1 + F_dr)/(1 - F_dr).
+    [Jensen2001, after eq. 4]
     """
     scattering, absorption = np.asarray(scattering, np.float64), np.asarray(absorption, np.float64)
     # α' = 1/(1 + σa/σs'), which has a value where either is 0 or infinite; 0/0, which does nothing, reflects nothing.
@@ -71,16 +71,17 @@ def _image(ior: float) -> float:
 
 
 def beyond(radius: Any, lost: Any, ior: float) -> np.ndarray:
-    """Return the share of the reflected light that leaves at more than `radius` from where it entered, by the dipole.
+    """Return the share of the reflected light that leaves farther than `radius` from where it entered, by the dipole.
 
-    radius: in mean free paths. lost: 1 - α', the share absorbed at each collision, in [0, 1]. ior: index of refraction.
+    radius: distance in mean free paths. lost: 1 - α', the share absorbed at each collision, in [0, 1]. ior: index of
+    refraction.
 
     The share is (z_r e^(-σ d_r)/d_r + z_v e^(-σ d_v)/d_v)/(e^(-σ z_r) + e^(-σ z_v)), σ = √(3(1 - α')), d = √(r² + z²),
     since the flux z (1 + σd) e^(-σd)/(4π d³) of each source is -∂/∂d of z e^(-σd)/(4π d) over d. [Jensen2001, eq. 4]
 
-    The 95 % radius is within 12 % of a random walk's with Fresnel's boundary for α' from .7
-    (tests/scenes/test_scale.py), and a third too long at α' = .3. Christensen and Burley's profile, fitted without a
-    boundary, has half of it.
+    The radius that 95 % of the light stays within agrees with a random walk with Fresnel's boundary to 12 % for α' of
+    at least .7 (tests/scenes/test_scale.py), and is a third too long at α' = .3. Christensen and Burley's profile,
+    which was fitted without a boundary, gives half of it.
     """
     root = np.sqrt(3 * np.asarray(lost, np.float64))
     radius = np.asarray(radius, np.float64)
@@ -101,7 +102,7 @@ def within(share: float, lost: Any, ior: float) -> np.ndarray:
 
 
 def shape(albedo: Any) -> np.ndarray:
-    """Return the mean free path over d of Christensen and Burley's profile, for light along the normal.
+    """Return the ratio of the mean free path to d of Christensen and Burley's profile, for light along the normal.
 
     albedo: the diffuse reflectance in [0, 1]. [ChristensenBurley2015, eq. 5]
     """
@@ -118,18 +119,18 @@ class Gaussians:
 
     @property
     def least(self) -> float:
-        """A length, in mm, over which the line spread still looks flat."""
+        """Length in mm over which the line spread is still nearly constant."""
         return float(np.sqrt(self.variances.min())) / 8
 
     @property
     def widest(self) -> float:
-        """A length, in mm, that light goes at most on average."""
+        """Upper bound of the mean distance that light travels, in mm."""
         return float(np.sqrt(self.variances.max()))
 
     def line_spread(self, distance: np.ndarray) -> np.ndarray:
-        """Return the light that reaches a line at a distance in mm from the line where light enters, (…, 3).
+        """Return the light that reaches a line at a distance from the line where light enters, (…, 3).
 
-        It is ∫ R(√(x² + y²)) dy up to a factor: the same Gaussians in one dimension.
+        distance: in mm. The value is ∫ R(√(x² + y²)) dy up to a factor: the same Gaussians in one dimension.
         """
         x2 = np.square(distance)[..., None]
         return np.asarray((np.exp(x2 * (-0.5 / self.variances)) / np.sqrt(self.variances)) @ self.weights)
@@ -145,18 +146,18 @@ class Burley:
     @property
     def least(self) -> float:
         # The line spread grows like log 1/x: what a first panel is off by must be as short as this.
-        """A length, in mm, over which a first panel may be inexact."""
+        """Length in mm of the first panel of a quadrature, over which the line spread may be inexact."""
         return 1e-13 * float(self.d.min())
 
     @property
     def widest(self) -> float:
-        """A length, in mm, that light goes at most on average."""
+        """Upper bound of the mean distance that light travels, in mm."""
         return 3 * float(self.d.max())
 
     def line_spread(self, distance: np.ndarray) -> np.ndarray:
-        """Return the line spread, (…, 3) up to a factor, at distances in mm.
+        """Return the line spread, (…, 3) up to a factor.
 
-        ∫ e^(-√(x² + y²)/d)/√(x² + y²) dy = 2 K₀(x/d), so it is K₀(x/d) + K₀(x/3d).
+        distance: in mm. ∫ e^(-√(x² + y²)/d)/√(x² + y²) dy = 2 K₀(x/d), so the value is K₀(x/d) + K₀(x/3d).
         """
         x = np.asarray(distance)[..., None] / self.d
         return np.asarray((special.k0(x) + special.k0(x / 3)) / self.d)
@@ -172,19 +173,19 @@ class Dipole:
 
     @property
     def least(self) -> float:
-        """A length, in mm, over which the line spread still looks flat."""
+        """Length in mm over which the line spread is still nearly constant."""
         return float(self.path.min()) / 8
 
     @property
     def widest(self) -> float:
         # Without absorption the mean distance is infinite, by a logarithm.
-        """A length, in mm, that light goes at most."""
+        """Upper bound of the distance that light travels, in mm."""
         return 100 * float(self.path.max())
 
     def line_spread(self, distance: np.ndarray) -> np.ndarray:
-        """Return the line spread, (…, 3) up to a factor, at distances in mm.
+        """Return the line spread, (…, 3) up to a factor.
 
-        -∂/∂z ∫ e^(-σd)/d dy = -∂/∂z 2 K₀(σρ) = 2σ z/ρ K₁(σρ), ρ = √(x² + z²), for source and image.
+        distance: in mm. -∂/∂z ∫ e^(-σd)/d dy = -∂/∂z 2 K₀(σρ) = 2σ z/ρ K₁(σρ), ρ = √(x² + z²), for source and image.
         """
         x, root = np.asarray(distance)[..., None] / self.path, np.sqrt(3 * self.lost)
         total = np.zeros(x.shape)

@@ -21,10 +21,10 @@ CONSTANTS = ("per_norm", "lobe_width")
 def user_model(slot: str, path: str | Path) -> Model:
     """Return the model in the file `path` for the slot `ndf` or `brdf`; its signature names its parameters.
 
-    An NDF is `real ndf_STEM_D(real cos_m, real p1, …)`, STEM the file's stem, at any scale, since the engine normalizes
-    it; a second parameter `sin2_m` gets sin²θ. A BRDF is `real3 brdf_STEM_f(real3 l, real3 v, …)` in 1/sr, in the local
-    frame with n = +z. Raises UsageError for another slot, FileError where the file cannot be read, and InputError where
-    it does not define such a function.
+    An NDF is `real ndf_STEM_D(real cos_m, real p1, …)`, where STEM is the file's stem. It may have any scale, since the
+    engine normalizes it. A second parameter `sin2_m` gets sin²θ. A BRDF is `real3 brdf_STEM_f(real3 l, real3 v, …)` in
+    1/sr, in the local frame with n = +z. Raises UsageError for another slot, FileError where the file cannot be read,
+    and InputError where it does not define such a function.
     """
     path = Path(path)
     if slot not in FORMS:

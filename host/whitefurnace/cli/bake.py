@@ -235,7 +235,7 @@ def _print_failure(name: str, error: WhitefurnaceError, as_json: bool) -> None:
 
 
 def print_baked(baked: Baked, output: Path, as_json: bool, quiet: bool) -> None:
-    """Print what a bake of one environment did or would do, notices first."""
+    """Print the result of a bake of one environment, or its plan in a dry run; notices come first."""
     for notice in () if quiet else baked.notices:
         say(f"notice: {baked.name}: {notice}")
     if as_json:
@@ -246,7 +246,7 @@ def print_baked(baked: Baked, output: Path, as_json: bool, quiet: bool) -> None:
 
 
 def baked_text(baked: Baked, output: Path) -> str:
-    """The text of a bake: a row for each level with its errors, then the files."""
+    """Return the text of a bake: a row for each level with its errors, then the files."""
     if baked.state == "skipped":
         return f"{baked.name}: up to date, nothing to do ({output / (baked.name + '.json')})"
     if baked.state == "planned":
@@ -348,7 +348,7 @@ def _first(manifest: Mapping[str, Any]) -> int:
 
 
 def planned_text(baked: Baked) -> str:
-    """The text of a planned bake: levels, files, and the kernel programs it would compile."""
+    """Return the text of a planned bake: its levels, its files, and the kernel programs it would compile."""
     several = len({names for names, _ in baked.plan}) > 1
     rows = [
         [
@@ -377,7 +377,9 @@ AS_READ = ("between", "texels", "levels", "format", "all")
 
 
 def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The table of total errors after the engines' sampling, by part; parts that no chain measured have no column."""
+    """Return the table of total errors after the engines' sampling, by part; parts that were not measured have no
+    column.
+    """
     if not found:
         return []
     parts = [part for part in AS_READ if any(part in read["parts"] for read in found)]
@@ -404,7 +406,7 @@ def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def baked_rows(baked: Baked) -> list[dict[str, Any]]:
-    """JSON rows of a bake: one for each level, then one for the whole."""
+    """Return the JSON rows of a bake: one for each level, then one for the whole."""
     rows: list[dict[str, Any]] = []
     if baked.state == "planned":
         rows += [

@@ -228,7 +228,7 @@ def _bar(summary: Summary, wanted: bool) -> Iterator[Callable[[], None]]:
 
 
 def result_row(result: Result) -> dict[str, Any]:
-    """The JSON row of an item of a batch."""
+    """Return the JSON row of an item of a batch."""
     row: dict[str, Any] = {
         "event": result.state,
         "kind": result.kind,
@@ -245,7 +245,7 @@ def result_row(result: Result) -> dict[str, Any]:
 
 
 def result_text(result: Result) -> str:
-    """The text of an item: one line, with its files if it is planned; empty if it was skipped or failed."""
+    """Return the text of an item: one line, with its files if it is planned; empty if it was skipped or failed."""
     if result.state == "done":
         error = "" if result.error is None else f", error {result.error:.1e}"
         return f"{result.place}: {size(result.nbytes)}{error}, {sum(result.seconds.values()):.2f} s"
@@ -267,18 +267,18 @@ def result_text(result: Result) -> str:
 
 
 def rate_text(summary: Summary) -> str:
-    """The items per second and the failures so far."""
+    """Return the items per second and the failures so far, as text."""
     failed = f", {len(summary.failed)} failed" if summary.failed else ""
     return f"{summary.count / max(summary.wall, 1e-9):.3g}/s{failed}"
 
 
 def failures_text(summary: Summary) -> list[str]:
-    """A line for each failure with its reason."""
+    """Return a line for each failure with its reason."""
     return [f"failed: {result.place}: {result.message} (exit code {result.exit_code})" for result in summary.failed]
 
 
 def summary_text(summary: Summary) -> str:
-    """The summary of a batch in one line."""
+    """Return the summary of a batch in one line."""
     states = {"done": "done", "planned": "to do", "skipped": "up to date", "failed": "failed"}
     if summary.total and summary.states["skipped"] == summary.total:
         return f"{summary.total} items, all up to date: nothing to do; {summary.wall:.2f} s"
@@ -296,7 +296,7 @@ def summary_text(summary: Summary) -> str:
 
 
 def summary_row(summary: Summary) -> dict[str, Any]:
-    """The JSON row of the summary, with every failure."""
+    """Return the JSON row of the summary, with every failure."""
     return {
         "event": "summary",
         "items": summary.total,

@@ -209,7 +209,7 @@ def _spread(spread: Spread, factor: float, digits: int = 3) -> tuple[str, str]:
 
 
 def cases_text(cases: Sequence[Case], flops: Mapping[str, float]) -> str:
-    """The table of the cases that can be measured."""
+    """Return the table of the cases that can be measured."""
     return table(
         ["case", "kernel", "what", "counted in", "flops"],
         [[c.name, c.kernel, c.about, f"{c.unit}s", f"{flops[c.name]:g}" if c.name in flops else ""] for c in cases],
@@ -218,7 +218,7 @@ def cases_text(cases: Sequence[Case], flops: Mapping[str, float]) -> str:
 
 
 def case_rows(cases: Sequence[Case], flops: Mapping[str, float]) -> list[dict[str, Any]]:
-    """JSON rows of the cases that can be measured."""
+    """Return the JSON rows of the cases that can be measured."""
     return [
         {
             "event": "planned",
@@ -234,7 +234,7 @@ def case_rows(cases: Sequence[Case], flops: Mapping[str, float]) -> list[dict[st
 
 
 def bench_text(rows: Sequence[Throughput], yardstick: Yardstick, device: str) -> str:
-    """The throughput of kernels, below the limits of the device."""
+    """Return the table of the throughput of kernels, with the limits of the device above it."""
     can = [[f"multiply-adds, float{p}", *_spread(s, 1), "GFLOP/s"] for p, s in yardstick.peak.items()]
     can += [
         [what, *_spread(s, 1), "GB/s"]
@@ -265,13 +265,13 @@ def bench_text(rows: Sequence[Throughput], yardstick: Yardstick, device: str) ->
 
 
 def bench_row(row: Throughput) -> dict[str, Any]:
-    """The JSON row of a kernel."""
+    """Return the JSON row of a kernel."""
     found = {name: value for name, value in vars(row).items() if name != "rate"}
     return {"event": "case", "per_second": _three(row.rate), **found}
 
 
 def yardstick_row(yardstick: Yardstick, device: Mapping[str, str]) -> dict[str, Any]:
-    """The JSON row of the limits of the device."""
+    """Return the JSON row of the limits of the device."""
     return {
         "event": "yardstick",
         "device": dict(device),
@@ -286,7 +286,7 @@ def _three(spread: Spread) -> dict[str, float]:
 
 
 def tradeoff_text(points: Sequence[Point], missed: Sequence[Missed] = ()) -> str:
-    """The table of error against time on one environment."""
+    """Return the table of error against time on one environment."""
     name = (points[0] if points else missed[0]).environment
     cells = [
         [
@@ -306,7 +306,7 @@ def tradeoff_text(points: Sequence[Point], missed: Sequence[Missed] = ()) -> str
 
 
 def costs_text(costs: Sequence[Cost], tolerance: float, missed: Sequence[Missed] = ()) -> str:
-    """The table of what a level costs by size, source size and roughness."""
+    """Return the table of the time of a level by output size, source size and roughness."""
     name = (costs[0] if costs else missed[0]).environment
     return "\n".join(
         [
@@ -325,7 +325,7 @@ def _missed(missed: Sequence[Missed]) -> list[str]:
 
 
 def tradeoff_rows(found: Sequence[Point | Missed | Cost]) -> list[dict[str, Any]]:
-    """JSON rows of measured points, of settings that could not be measured, and of costs."""
+    """Return the JSON rows of measured points, of settings that could not be measured, and of costs."""
     rows = []
     for one in found:
         row = {**vars(one), "event": type(one).__name__.lower()}

@@ -93,7 +93,7 @@ def compare(
 
 
 def compared_text(found: Comparison) -> str:
-    """The table of the errors of A against B, a row for each part."""
+    """Return the table of the errors of A against B, a row for each part."""
     rows = [
         [
             row.part,
@@ -117,7 +117,7 @@ def compared_text(found: Comparison) -> str:
 
 
 def compared_rows(found: Comparison) -> list[dict[str, Any]]:
-    """JSON rows of a comparison."""
+    """Return the JSON rows of a comparison."""
     return [
         {
             "event": "compared",

@@ -36,7 +36,7 @@ def devices(as_json: bool) -> None:
 
 
 def devices_text(found: Sequence[Candidate]) -> str:
-    """The table of devices with their verdicts."""
+    """Return the table of devices with their verdicts."""
     rows = [
         [str(c.index), c.type, f"{c.platform}: {c.name}", c.driver, "yes" if c.fp64 else "no", c.verdict] for c in found
     ]

@@ -50,7 +50,7 @@ def engines(name: str | None, as_toml: bool, as_json: bool) -> None:
 
 
 def engines_text(engines: Sequence[Engine]) -> str:
-    """The table of the engines that `--for` knows."""
+    """Return the table of the engines that `--for` knows."""
     rows = [
         [
             e.name,
@@ -66,7 +66,7 @@ def engines_text(engines: Sequence[Engine]) -> str:
 
 
 def engine_text(engine: Engine) -> str:
-    """The text of one engine: its files and how it reads them."""
+    """Return the text of one engine: its files and how it reads them."""
     lines = [
         f"{engine.name}: {engine.title}",
         f"  facts      {engine.facts}",

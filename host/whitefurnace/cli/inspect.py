@@ -42,7 +42,10 @@ def inspect(file: Path, as_json: bool) -> None:
 
 
 def inspect_text(row: Mapping[str, Any]) -> str:
-    """The text of a file's contents. `row` is that of `contents.described`."""
+    """Return the text of a file's contents.
+
+    row: the value of `contents.described`.
+    """
     lines = [f"{row['file']}: {row['kind']} in {row['container']}, {row['format']}"]
     header = {**row["header"], **({"bytes": size(row["header"]["bytes"])} if "bytes" in row["header"] else {})}
     for name in ("layers", "orientation"):

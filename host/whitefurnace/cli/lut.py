@@ -237,7 +237,7 @@ def lut(
 
 
 def print_table(made: Table, as_json: bool, quiet: bool) -> None:
-    """Print what was or would be written of a table."""
+    """Print the text or the JSON row of a table that was written, skipped or planned."""
     if as_json:
         print_row(table_row(made))
     elif not quiet:
@@ -245,7 +245,7 @@ def print_table(made: Table, as_json: bool, quiet: bool) -> None:
 
 
 def table_text(made: Table) -> str:
-    """The text of a table that was written, skipped or planned."""
+    """Return the text of a table that was written, skipped or planned."""
     name, beside = made.path, made.path.with_name(made.path.name + ".json")
     if made.state == "skipped":
         return f"{name}: up to date, nothing to do ({beside})"
@@ -292,7 +292,7 @@ def _stated_lines(made: Table) -> list[str]:
 
 
 def table_row(made: Table) -> dict[str, Any]:
-    """The JSON row of a table."""
+    """Return the JSON row of a table."""
     return {
         "event": made.state,
         "file": str(made.path),

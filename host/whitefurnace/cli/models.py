@@ -42,7 +42,7 @@ def models(name: str | None, as_json: bool) -> None:
 
 
 def models_text(entries: Sequence[Model]) -> str:
-    """The table of the catalogue."""
+    """Return the table of the catalogue."""
     rows = [[e.slot, e.name, e.title, ", ".join(_domains(e)), e.citation.key] for e in entries]
     return table(["slot", "name", "title", "parameters", "source"], rows, left=5)
 
@@ -60,7 +60,7 @@ def _domains(entry: Model) -> list[str]:
 
 
 def model_text(entry: Model) -> str:
-    """The text of one model: everything that its entry states."""
+    """Return the text of one model: everything that its entry states."""
     lines = [f"{entry.slot} {entry.name}: {entry.title}", f"  source      {entry.citation.text}"]
     rows = [
         [
@@ -94,7 +94,7 @@ def model_text(entry: Model) -> str:
 
 
 def model_rows(entries: Sequence[Model]) -> list[dict[str, Any]]:
-    """JSON rows of the catalogue."""
+    """Return the JSON rows of the catalogue."""
     return [
         {
             "slot": e.slot,

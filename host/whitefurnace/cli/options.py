@@ -1,7 +1,7 @@
-"""Commands and options in groups: the help of `whitefurnace` by task, that of a command by the subject of its options.
+"""Commands and options in groups. Help lists the commands by task, and the options of a command by subject.
 
-An option that several commands have stands here once, as a decorator. This module loads nothing heavy: `--help` is
-quick.
+An option that several commands have is declared once here, as a decorator. This module loads nothing heavy, so that
+`--help` is quick.
 """
 
 from __future__ import annotations
@@ -74,17 +74,19 @@ class Group(click.Group):
 
 
 def command(task: Task, summary: str, epilog: str, help: str | None = None) -> Callable[[Callable[..., Any]], Command]:
-    """Make a function the command of its own name.
+    """Return a decorator that makes a function the command of its own name.
 
-    task: the heading in `whitefurnace --help`. summary: one line beside the name there, at most 62 characters.
-    epilog: examples and exit codes, after the options. help: what the command does, by default the function's
-    docstring.
+    task: the heading in `whitefurnace --help`. summary: one line after the name there, at most 62 characters. epilog:
+    examples and exit codes, after the options. help: what the command does, by default the function's docstring.
     """
     return click.command(cls=Command, task=task, short_help=summary, epilog=epilog, help=help)
 
 
 def option(*names: str, heading: str, help: str, **attributes: Any) -> Decorator:
-    """An option of one command; `attributes` are those of `click.option`."""
+    """Return a decorator that adds an option to one command.
+
+    names: the option's names. heading: the heading in the command's help. attributes: those of `click.option`.
+    """
     return click.option(*names, cls=Option, heading=heading, help=help, **attributes)
 
 
@@ -112,7 +114,7 @@ def ndf(help: str, *, default: str | None = None, heading: str) -> Decorator:
 
 
 def fresnel_help(help: str) -> str:
-    """The help of an option that takes a Fresnel model."""
+    """Return the help of an option that takes a Fresnel model; `help` follows its first two words."""
     return f"Fresnel model{help}, as NAME[:p=v,...] or NAME:PRESET (schlick:gold); see `whitefurnace models`."
 
 

@@ -273,7 +273,7 @@ def _tabulate(needs: Needs, output: Path, device: str | None, force: bool, as_js
 
 
 def scene_text(scene: Scene, needs: Needs) -> str:
-    """The text of a scene: its materials, and which parts of a bake they need."""
+    """Return the text of a scene: its materials, and which parts of a bake they need."""
     box = scene.extent
     uses = sum(m.uses for m in scene.materials)
     head = [
@@ -356,7 +356,7 @@ def _also(m: Material) -> list[str]:
 
 
 def scene_rows(scene: Scene, needs: Needs) -> list[dict[str, Any]]:
-    """JSON rows: the scene, each material, each need, and the whole."""
+    """Return the JSON rows of a scene: the scene, each material, each need, and the whole."""
 
     def plain(x: float) -> float | None:
         return x if math.isfinite(x) else None  # an attenuation distance
@@ -423,7 +423,7 @@ def scene_rows(scene: Scene, needs: Needs) -> list[dict[str, Any]]:
 
 
 def media_text(found: Sequence[Inside], pixel: Pixel | None) -> str:
-    """The text of what the media of a scene need at its scale."""
+    """Return the text of what the media of a scene need at its scale."""
     lines = [f"  inside, where {pixel.text}:" if pixel else "  inside:"]
     if not found:
         lines.append("    no material has a volume: give --medium [MATERIAL:]MEDIUM")
@@ -433,7 +433,7 @@ def media_text(found: Sequence[Inside], pixel: Pixel | None) -> str:
 
 
 def media_rows(found: Sequence[Inside], pixel: Pixel | None) -> list[dict[str, Any]]:
-    """A JSON row for each medium."""
+    """Return a JSON row for each medium."""
     of = {"camera": pixel.of or None} if pixel else {}
     return [
         {
@@ -450,7 +450,7 @@ def media_rows(found: Sequence[Inside], pixel: Pixel | None) -> list[dict[str, A
 
 
 def budget_text(found: Budget, choice: Choice | None = None) -> str:
-    """The text of each approximation's error on a scene in one environment, and of the bake that was chosen."""
+    """Return the text of each approximation's error on a scene in one environment, and of the bake that was chosen."""
     rows = [*(e for e in found.entries if e.used), found.files, found.floor, found.whole]
     head = [
         f"  errors of reflected radiance in {found.environment}, at {found.points} points of the scene's materials",
@@ -495,7 +495,7 @@ def _chosen_lines(found: Budget, choice: Choice | None) -> Iterable[str]:
 
 
 def budget_rows(found: Budget, choice: Choice | None = None) -> list[dict[str, Any]]:
-    """JSON rows: each approximation, the whole, and the choice."""
+    """Return the JSON rows of an error budget: each approximation, the whole, and the choice."""
 
     def row(e: Entry) -> dict[str, Any]:
         return {

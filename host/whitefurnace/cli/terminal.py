@@ -1,4 +1,4 @@
-"""What all commands print with: JSON rows on stdout, notices on stderr, progress bars where stderr is a terminal."""
+"""Prints for all commands: JSON rows on stdout, notices on stderr, and progress bars where stderr is a terminal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,9 @@ def say(text: str) -> None:
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON can hold it: NaN and infinities as strings, tuples as lists, also inside mappings and lists."""
+    """Return `value` as JSON can hold it, also inside mappings and lists: NaN and infinities as strings, tuples as
+    lists.
+    """
     if isinstance(value, Mapping):
         return {name: plain(v) for name, v in value.items()}
     if isinstance(value, float):
@@ -34,10 +36,10 @@ def plain(value: Any) -> Any:
 
 @contextlib.contextmanager
 def progress(wanted: bool) -> Iterator[Callable[[str, str, float], None] | None]:
-    """Show progress bars on stderr, where that is a terminal.
+    """Show progress bars on stderr, where that is a terminal, while the block runs.
 
-    Gives a function of a name, what is being done and the share in [0, 1] that is done; a bar for each name. Gives
-    None where no bar is wanted or possible.
+    The block gets a function of a name, the current activity and the share in [0, 1] that is done; each name has its
+    own bar. It gets None where no bar is wanted or possible.
     """
     if not wanted or not sys.stderr.isatty():
         yield None
@@ -63,14 +65,17 @@ def progress(wanted: bool) -> Iterator[Callable[[str, str, float], None] | None]
 
 
 def of_one(report: Callable[[str, str, float], None] | None, name: str) -> Callable[[str, float], None] | None:
-    """The progress of one named piece of work: a function of what is being done and its share, None without a bar."""
+    """Return the progress function of one named piece of work, or None where `report` is None.
+
+    The function takes the current activity and the share in [0, 1] that is done.
+    """
     return None if report is None else lambda what, share: report(name, what, share)
 
 
 def plots_into(folder: Path) -> None:
-    """Make the folder for plots before the work begins, not after it.
+    """Make the folder for plots before the work begins, so that an error is found early.
 
-    Raises UnsupportedError where matplotlib is missing, FileError where the folder cannot be made.
+    Raises UnsupportedError where matplotlib is not installed, and FileError where the folder cannot be made.
     """
     from whitefurnace import plot_style
     from whitefurnace.errors import FileError

@@ -109,7 +109,7 @@ VERIFY_HEAD = (
 
 
 def verify_text(rows: Sequence[Row]) -> str:
-    """Lines below `VERIFY_HEAD` for the checks of one model: the worst cell of each, and counterexamples."""
+    """Return the lines below `VERIFY_HEAD` for one model: the worst cell of each check, and counterexamples."""
     lines = [f"{rows[0].slot} {rows[0].model}"]
     for row in rows:
         verdict = "FAIL" if not row.passed else "pass" if row.tolerance is not None else "told"
@@ -135,7 +135,7 @@ def _where(values: Mapping[str, Any], digits: str = ".4g") -> str:
 
 
 def verify_summary(rows: Sequence[Row], seconds: float, device: str) -> str:
-    """The summary: the number of checks and models, and how many passed."""
+    """Return the summary: the number of checks and models, and how many passed."""
     informational = sum(row.tolerance is None and row.passed for row in rows)
     failed = sum(not row.passed for row in rows)
     subjects = len({(row.slot, row.model) for row in rows})
@@ -148,7 +148,7 @@ def verify_summary(rows: Sequence[Row], seconds: float, device: str) -> str:
 
 
 def verify_rows(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """JSON rows of checks; NaN and infinities are strings."""
+    """Return the JSON rows of checks; NaN and infinities are strings."""
     return [
         {
             "event": "check",
