@@ -332,14 +332,16 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
     written = shading.dictionary(read_manifest(Path(manifest)))
     recipe, source = shading.dictionary(written.get("recipe")), shading.dictionary(written.get("source"))
     item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
-    turn, exposure = recipe.get("rotate"), recipe.get("exposure")
-    for name, value in (("rotate", turn), ("exposure", exposure)):
+    told: dict[str, float] = {}
+    for name in ("rotate", "exposure"):
+        value = recipe.get(name)
         if not isinstance(value, (int, float)):
             raise InputError(f"{manifest} tells no {name}: it is not the manifest of a bake")
+        told[name] = float(value)
     found = environment(
         item,
-        rotate=float(turn),
-        exposure=float(exposure),  # type: ignore[arg-type]
+        rotate=told["rotate"],
+        exposure=told["exposure"],
         nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse",
     )
     if found.digest != source.get("sha256"):

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -53,7 +53,7 @@ class Table:
 
     kind: Kind
     path: Path
-    state: str
+    state: Literal["done", "skipped", "planned"]
     shape: tuple[int, ...]
     axes: tuple[Axis, ...]
     nbytes: int
@@ -134,22 +134,17 @@ def lut(
 
     Raises UsageError, UnsupportedError, FileError, CheckError, DeviceError, and InputError for a bad environment.
     """
+    models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf}
+    lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
+    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite}
     request = TableRequest(
         kind,
         path,
         size=size,
         axes=axes,
-        ndf=ndf,
-        masking=masking,
-        fresnel=fresnel,
-        diffuse=diffuse,
-        brdf=brdf,
-        light=light,
-        environment=environment,
-        normal=normal,
-        rotate=rotate,
-        exposure=exposure,
-        nonfinite=nonfinite,
+        **models,
+        **lit,
+        **reading,
         backfacing=backfacing,
         precision=precision,
         tolerance=tolerance,
