@@ -141,7 +141,7 @@ def glass(
 
 
 def _stated(shares: np.ndarray, scheme: str | None) -> dict[str, Any]:
-    """Return what the manifest states of the shares (cells, 2) of a scheme."""
+    """Return the manifest's facts about the shares (cells, 2) of a scheme."""
     both = shares.sum(1, dtype=np.float64)
     return {
         "channels": ["reflected", "transmitted"],

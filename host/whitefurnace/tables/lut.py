@@ -136,26 +136,11 @@ def lut(
     """
     models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf}
     lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
-    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite}
-    request = TableRequest(
-        kind,
-        path,
-        size=size,
-        axes=axes,
-        **models,
-        **lit,
-        **reading,
-        backfacing=backfacing,
-        precision=precision,
-        tolerance=tolerance,
-        fit=fit,
-        as_read=as_read,
-        scheme=scheme,
-        stored=stored,
-        for_=for_,
-        force=force,
-        parameters={**(parameters or {}), **fixed},
-    )
+    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite, "backfacing": backfacing}
+    accuracy: dict[str, Any] = {"precision": precision, "tolerance": tolerance, "fit": fit, "as_read": as_read}
+    form: dict[str, Any] = {"size": size, "axes": axes, "scheme": scheme, "stored": stored, "for_": for_}
+    numbers = {**(parameters or {}), **fixed}
+    request = TableRequest(kind, path, **models, **lit, **reading, **accuracy, **form, force=force, parameters=numbers)
     return make(plan(request), device, dry_run=dry_run, progress=progress)
 
 
