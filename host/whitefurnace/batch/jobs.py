@@ -865,7 +865,7 @@ def _of_baked(item: Item, baked: baking.Baked, seconds: dict[str, float]) -> Res
         item.place,
         item.name,
         baked.state,
-        item.output,
+        item.output,  # type: ignore[arg-type]
         str(Path(item.output, f"{item.name}.json")),
         seconds,
         sum(files.values()),
@@ -883,7 +883,7 @@ def _of_table(item: Item, table: tables.Table, seconds: dict[str, float]) -> Res
         item.place,
         item.name,
         table.state,
-        item.output,
+        item.output,  # type: ignore[arg-type]
         f"{item.output}.json",
         seconds,
         nbytes,

@@ -178,7 +178,7 @@ def _decoded(path: Path, size: int) -> Iterator[tuple[int, int, int, Codes]]:
     import OpenImageIO as oiio
 
     with open(path, "rb") as file:
-        check_file(path, size, file.read(4096), [])
+        check_file(path, size, file.read(4096))
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), hints)

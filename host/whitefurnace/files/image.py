@@ -5,9 +5,11 @@ A file that is missing, truncated, corrupted or has a wrong size in its header r
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import stat
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -19,7 +21,11 @@ import numpy.typing as npt
 from whitefurnace.errors import FileError, InputError
 from whitefurnace.files import memory
 from whitefurnace.files.atomic import digest_file
+from whitefurnace.files.colour import LINEAR, SRGB_CURVE, Encoding
+from whitefurnace.files.declared import Declared, read_declared
+from whitefurnace.files.hdr_header import Radiance, read_radiance_header
 from whitefurnace.files.integrity import check_file
+from whitefurnace.files.png import _scratch_file
 
 MAX_PIXELS = 32768 * 16384
 MAX_SIDE = 65536
@@ -28,8 +34,9 @@ _CHUNK_BYTES = 8 << 20
 _MAX_RATIO = 2000
 # Formats of OpenImageIO that are no images: `null` makes one from a file's name, `zfile` holds depth.
 _NOT_IMAGES = ("null", "zfile", "term")
-_REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
-_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+# Formats of printing density (Cineon), of unknown curves and primaries, or of measurements of any unit (FITS).
+_UNREAD = ("cineon", "fits", "rla", "softimage")
+_SRGB = Encoding((SRGB_CURVE,), "sRGB")
 
 
 @dataclass(frozen=True)
@@ -53,11 +60,7 @@ class Image:
 @cache
 def srgb_table(dtype: str) -> npt.NDArray[np.float32]:
     """Return the linear value of every sRGB code of `dtype` ("uint8" or "uint16"): float32 (256,) or (65536,)."""
-    top = np.iinfo(dtype).max
-    encoded = np.arange(top + 1, dtype=np.float64) / top
-    # IEC 61966-2-1: a linear toe below 0.04045, a power of 2.4 above.
-    linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return linear.astype(np.float32)
+    return _SRGB.tables(dtype)[0]
 
 
 def decode_srgb(codes: npt.NDArray[Any], out: npt.NDArray[np.float32] | None = None) -> npt.NDArray[np.float32]:
@@ -67,19 +70,29 @@ def decode_srgb(codes: npt.NDArray[Any], out: npt.NDArray[np.float32] | None = N
     """
     if out is None:
         out = np.empty(codes.shape, np.float32)
-    np.take(srgb_table(codes.dtype.name), codes[..., :3], out=out[..., :3], mode="clip")
+    _look_up(codes, out, (srgb_table(codes.dtype.name),))
+    return out
+
+
+def _look_up(codes: npt.NDArray[Any], out: npt.NDArray[np.float32], tables: Sequence[npt.NDArray[np.float32]]) -> None:
+    """Decode codes (..., 1 | 3 | 4) by one table, or by those of R, G and B; a fourth channel is divided."""
+    if len(tables) == 1:
+        np.take(tables[0], codes[..., :3], out=out[..., :3], mode="clip")
+    else:
+        for channel in range(min(codes.shape[-1], 3)):
+            out[..., channel] = np.take(tables[channel], codes[..., channel], mode="clip")
     if codes.shape[-1] == 4:
         np.divide(codes[..., 3], np.float32(np.iinfo(codes.dtype).max), out=out[..., 3])
-    return out
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
     """Read an image as linear Rec.709 float32.
 
-    Integers of 8 and 16 bits are decoded from sRGB, except a fourth channel; floats are taken as linear. An EXR or HDR
-    with other primaries is converted, with Bradford adaptation of its white. Extra channels are left out with a
-    notice. Raises `FileError` for a file that cannot be opened, and `InputError` for one that is not a valid image of
-    1, 3 or 4 channels with at most 32768 x 16384 pixels and 65536 a side.
+    Integers of 8 and 16 bits are decoded from sRGB, except a fourth channel; floats are taken as linear, unless the
+    file states another encoding. Its ICC profile, code points, gamma, primaries, exposure and orientation are applied
+    and named in the notices; docs/inputs.md lists them. Extra channels are left out with a notice. Raises `FileError`
+    for a file that cannot be opened, and `InputError` for one that is not a valid image of 1, 3 or 4 channels with at
+    most 32768 x 16384 pixels and 65536 a side, or that states what is not read.
     """
     path = Path(path)
     size = _regular_size(path)
@@ -112,60 +125,156 @@ def _regular_size(path: Path) -> int:
     return status.st_size
 
 
-def _read(path: Path, size: int, digest: str) -> Image:
+@dataclass(frozen=True)
+class Opened:
+    """An image file that OpenImageIO has opened: its object, specification and format; `radiance` of a .hdr alone."""
+
+    source: Any
+    spec: Any
+    form: str
+    radiance: Radiance | None
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the upright picture in its display window."""
+        if self.radiance is not None:
+            return self.radiance.width, self.radiance.height
+        width, height = self.spec.full_width, self.spec.full_height
+        return (height, width) if 5 <= self.orientation <= 8 else (width, height)
+
+    @property
+    def orientation(self) -> int:
+        """Exif's, 1 to 8; another number where the file states one that does not exist."""
+        # libjxl turns the picture itself, and Exif in JPEG XL is to be ignored [ISO/IEC 18181-2, 9.3].
+        return 1 if self.form == "jpegxl" else int(self.spec.get_int_attribute("Orientation", 1))
+
+
+@contextlib.contextmanager
+def opened(path: Path, size: int, *, unassociated: bool = False) -> Iterator[Opened]:
+    """Open an image file of `size` bytes, check its sizes and give it to a `with` statement.
+
+    unassociated: values come as stored, colour is not multiplied by coverage. Raises `FileError` and `InputError`, for
+    errors within the statement too.
+    """
     import OpenImageIO as oiio
 
-    notices: list[str] = []
-    with open(path, "rb") as file:
-        head = file.read(4096)
-    check_file(path, size, head, notices)
-
-    # Read values as stored: colour is not multiplied by coverage.
     hints = oiio.ImageSpec()
-    hints.attribute("oiio:UnassociatedAlpha", 1)
-    try:
-        source = oiio.ImageInput.open(str(path), hints)
-    except (UnicodeError, TypeError) as error:  # a name that is not Unicode is no string to the binding
-        raise FileError(f"cannot read {str(path)!r}: its name is not valid Unicode") from error
-    complaint = _complaint(oiio)  # fetched even without a failure: else it is printed at exit
-    if source is None:
-        if "could not find a format reader" in complaint or not complaint:
-            raise InputError(f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG")
-        raise InputError(f"{path} is not a valid image: {_reason(complaint, path)}")
-    try:
-        return _decode(source, path, size, digest, head, notices)
-    finally:
-        source.close()
-        _complaint(source)
+    if unassociated:
+        hints.attribute("oiio:UnassociatedAlpha", 1)
+    with contextlib.ExitStack() as stack:
+        with open(path, "rb") as file:
+            head = file.read(4096)
+        check_file(path, size, head)
+        radiance = read_radiance_header(path) if head.startswith(b"#?") else None
+        shown = path
+        if radiance is not None:
+            flat = radiance.unpacked(path)
+            if flat is not None or not radiance.plain or b"\r" in head[: radiance.start]:
+                path = stack.enter_context(_scratch_file(".hdr"))
+                radiance.rewrite(shown, path, flat)
+        try:
+            source = oiio.ImageInput.open(str(path), hints)
+        except (UnicodeError, TypeError) as error:  # a name that is not Unicode is no string to the binding
+            raise FileError(f"cannot read {str(path)!r}: its name is not valid Unicode") from error
+        complaint = _complaint(oiio)  # fetched even without a failure: else it is printed at exit
+        if source is None:
+            raise _not_opened(complaint, path, shown, head)
+        try:
+            spec, form = source.spec(), source.format_name()
+            if form in _NOT_IMAGES:
+                raise InputError(f"{path} is a file of kind {form}, an image of radiance was expected")
+            if form in _UNREAD:
+                raise InputError(f"{path} is a file of kind {form}, whose statements of colour are not read; use EXR")
+            _check_size(spec, path, size, form)
+            yield Opened(source, spec, form, radiance if form == "hdr" else None)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), str(shown))) from error
+        finally:
+            source.close()
+            _complaint(source)
 
 
-def _decode(source: Any, path: Path, size: int, digest: str, head: bytes, notices: list[str]) -> Image:
-    spec = source.spec()
-    form = source.format_name()
-    if form in _NOT_IMAGES:
-        raise InputError(f"{path} is a file of kind {form}, an image of radiance was expected")
-    _check_size(spec, path, size, form)
+def _not_opened(complaint: str, path: Path, shown: Path, head: bytes) -> InputError:
+    if head[4:8] == b"ftyp" and head[8:12] in (b"avif", b"avis", b"heic", b"heix", b"hevc", b"mif1", b"msf1"):
+        return InputError(f"{shown} is an AVIF or HEIF image, which is not read; convert it to EXR or PNG")
+    if "could not find a format reader" in complaint or not complaint:
+        return InputError(f"{shown} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG")
+    return InputError(f"{shown} is not a valid image: {_reason(complaint, path)}")
+
+
+def _read(path: Path, size: int, digest: str) -> Image:
+    with opened(path, size, unassociated=True) as found:
+        return _decode(found, path, digest)
+
+
+def _decode(found: Opened, path: Path, digest: str) -> Image:
+    source, spec, form = found.source, found.spec, found.form
+    notices: list[str] = []
     picks = _pick_channels(list(spec.channelnames), path, form, notices)
     pixel = str(spec.format)
     # Channels of an EXR may differ in type; OpenImageIO converts all to the type of the first.
     if pixel not in ("uint8", "uint16", "half", "float", "double"):
         raise InputError(f"{path} has pixels of type {pixel}, 8- or 16-bit unsigned integers or floats were expected")
-    pixels = _read_pixels(source, spec, picks, path, pixel)
-    colour_space = str(spec.get_string_attribute("oiio:ColorSpace"))
-    if pixel in ("uint8", "uint16") and form != "pnm" and colour_space and "srgb" not in colour_space.lower():
-        notices.append(
-            f"{path}: states the colour space {colour_space}, its integers were decoded as sRGB all the same"
-        )
-    stated = spec.get_float_attribute("hdr:exposure", 1.0)
-    if form == "hdr" and stated != 1.0:
-        notices.append(f"{path}: states EXPOSURE={stated:g}, which was not applied")
+    if found.radiance is not None:
+        declared = Declared(found.radiance.encoding)
+        notices += found.radiance.notices
+    else:
+        declared = read_declared(path, form, spec, notices)
+    # TIFF, PNG and WebP are looked at in `declared`; others have one image, or the whole one first.
+    if form in ("gif", "ico", "jpegxl") and source.seek_subimage(1, 0):
+        if form != "ico":
+            raise InputError(f"{path} holds several images or frames, a single one was expected")
+        source.seek_subimage(0, 0)
+        notices.append(f"{path}: only the first of its images was read")
+    _complaint(source)
     if int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
         notices.append(f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read")
-    primaries = _primaries(spec, form, head)
-    if primaries is not None and pixels.shape[2] >= 3:
-        _to_rec709(pixels, primaries, path, notices)
-    pixels = _upright(pixels, spec.get_int_attribute("Orientation", 1))
+    pixels = _radiance(source, spec, picks, path, pixel, declared, notices)
+    if found.radiance is not None:
+        pixels = found.radiance.upright(pixels)
+    else:
+        if not 1 <= found.orientation <= 8:
+            notices.append(
+                f"{path}: states the orientation {found.orientation}, 1 to 8 exist; its rows were taken as stored"
+            )
+        pixels = _upright(pixels, found.orientation)
     return Image(pixels, path, digest, form, tuple(notices))
+
+
+def _radiance(
+    source: Any, spec: Any, picks: list[int], path: Path, pixel: str, declared: Declared, notices: list[str]
+) -> npt.NDArray[np.float32]:
+    """Read the pixels and bring them to linear Rec. 709 by the encoding that the file states."""
+    integer = pixel in ("uint8", "uint16")
+    default = SRGB_CURVE if integer else LINEAR
+    encoding = declared.encoding
+    if encoding is None or encoding.is_near(default):
+        encoding = Encoding((default,), "")
+    encoding.check_channels(len(picks), path)
+    associated = declared.associated and len(picks) == 4
+    if integer and not associated:
+        tables = encoding.tables(pixel)
+        if declared.inverted:
+            tables = tuple(table[::-1] for table in tables)
+        pixels = _read_pixels(source, spec, picks, path, pixel, tables)
+    else:
+        pixels = _read_pixels(source, spec, picks, path, "float")
+        if associated and encoding.curves != (LINEAR,):
+            # The curve was applied before the colour was multiplied by alpha.
+            alpha = pixels[..., 3:]
+            np.divide(pixels[..., :3], alpha, out=pixels[..., :3], where=alpha > 0)
+            if integer:
+                np.minimum(pixels[..., :3], 1, out=pixels[..., :3])
+            encoding.linearize(pixels, path)
+            pixels[..., :3] *= alpha
+        else:
+            encoding.linearize(pixels, path)
+    outside = encoding.to_rec709(pixels)
+    if encoding.said:
+        notices.append(f"{path}: converted to linear Rec.709 from {encoding.said}")
+    if outside:
+        notices.append(f"{path}: {outside}")
+    return pixels
 
 
 def _check_size(spec: Any, path: Path, size: int, form: str) -> None:
@@ -230,8 +339,15 @@ def _pick_channels(names: list[str], path: Path, form: str, notices: list[str]) 
     return picks
 
 
-def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: str) -> npt.NDArray[np.float32]:
-    """Read the display window, (height, width, len(picks)).
+def _read_pixels(
+    source: Any,
+    spec: Any,
+    picks: list[int],
+    path: Path,
+    pixel: str,
+    tables: Sequence[npt.NDArray[np.float32]] = (),
+) -> npt.NDArray[np.float32]:
+    """Read the display window, (height, width, len(picks)); codes of integers are looked up in `tables`.
 
     Rows are read in bands, so that memory of `out` is committed only for rows that the file holds; a header with a
     wrong size takes no memory.
@@ -275,56 +391,8 @@ def _read_pixels(source: Any, spec: Any, picks: list[int], path: Path, pixel: st
                 return band  # one band holds the whole image
             part[...] = band
         else:
-            decode_srgb(band, part)
+            _look_up(band, part, tables)
     return out
-
-
-def _primaries(spec: Any, form: str, head: bytes) -> tuple[float, ...] | None:
-    """Return the CIE xy of red, green, blue and white that the file states, or None."""
-    if form == "openexr":
-        stated = spec.getattribute("chromaticities")
-        if stated is not None and len(stated) == 8:
-            return tuple(float(value) for value in stated)
-    if form == "hdr":  # OpenImageIO does not read this line
-        for line in head.split(b"\n\n")[0].split(b"\n"):
-            if line.startswith(b"PRIMARIES="):
-                try:
-                    values = tuple(float(word) for word in line[10:].split())
-                except ValueError:
-                    return None
-                return values if len(values) == 8 else None
-    return None
-
-
-def _rgb_to_xyz(primaries: tuple[float, ...]) -> npt.NDArray[np.float64]:
-    xy = np.array(primaries, np.float64).reshape(4, 2)
-    xyz = np.stack([xy[:, 0], xy[:, 1], 1 - xy.sum(1)]) / xy[:, 1]
-    return xyz[:, :3] * np.linalg.solve(xyz[:, :3], xyz[:, 3])
-
-
-def _to_rec709(pixels: npt.NDArray[np.float32], primaries: tuple[float, ...], path: Path, notices: list[str]) -> None:
-    """Convert `pixels` (height, width, 3 | 4) to Rec.709 in place.
-
-    The matrix is Rec.709⁻¹ · Bradford⁻¹ · diag(white ratio) · Bradford · source.
-    """
-    # 1e-3 allows for the rounding of the numbers in files (.3127 against .31271).
-    if np.allclose(primaries, _REC709, rtol=0, atol=1e-3):
-        return
-    shown = " ".join(f"{value:g}" for value in primaries)
-    with np.errstate(all="ignore"):
-        try:
-            source, target = _rgb_to_xyz(primaries), _rgb_to_xyz(_REC709)
-            adapt = np.diag((_BRADFORD @ target.sum(1)) / (_BRADFORD @ source.sum(1)))
-            matrix = np.linalg.inv(target) @ np.linalg.inv(_BRADFORD) @ adapt @ _BRADFORD @ source
-        except np.linalg.LinAlgError:
-            matrix = np.full((3, 3), np.nan)
-        # Real colour spaces stay below 4; values in the thousands mean that the primaries lie on one line.
-        if not np.all(np.abs(matrix) < 1e3):
-            raise InputError(f"{path} states primaries ({shown}) that span no colour space")
-        rows = max(1, _CHUNK_BYTES // (pixels.shape[1] * 24))
-        for y in range(0, len(pixels), rows):
-            pixels[y : y + rows, :, :3] = pixels[y : y + rows, :, :3] @ matrix.T
-    notices.append(f"{path}: converted to linear Rec.709 from the primaries it states ({shown})")
 
 
 def _upright(pixels: npt.NDArray[np.float32], orientation: int) -> npt.NDArray[np.float32]:

@@ -15,7 +15,6 @@ import numpy.typing as npt
 from whitefurnace.errors import FileError, InputError
 from whitefurnace.files import image
 from whitefurnace.files.binary import load
-from whitefurnace.files.integrity import check_file
 from whitefurnace.files.packing import unpack
 from whitefurnace.files.png import decode_png
 
@@ -75,42 +74,23 @@ def _opened(path: Path) -> Iterator[tuple[Any, ImageFacts]]:
     size = image._regular_size(path)
     if size == 0:
         raise InputError(f"{path} is empty, an image file was expected")
-    import OpenImageIO as oiio
-
     try:
-        with open(path, "rb") as file:
-            check_file(path, size, file.read(4096), [])
-        source = oiio.ImageInput.open(str(path))
-        complaint = image._complaint(oiio)
-        if source is None:
-            raise InputError(
-                f"{path} is not an image in a format that is known, such as EXR, HDR, PNG, TIFF or JPEG"
-                if "could not find a format reader" in complaint or not complaint
-                else f"{path} is not a valid image: {image._reason(complaint, path)}"
-            )
-        try:
-            spec, form = source.spec(), source.format_name()
-            if form in image._NOT_IMAGES:
-                raise InputError(f"{path} is a file of kind {form}, an image was expected")
-            image._check_size(spec, path, size, form)
+        with image.opened(path, size) as found:
+            spec = found.spec
             own: dict[str, Any] = {
                 a.name.removeprefix(PREFIX): a.value for a in spec.extra_attribs if a.name.startswith(PREFIX)
             }
             yield (
-                source,
+                found.source,
                 ImageFacts(
-                    form,
-                    spec.full_width,
-                    spec.full_height,
+                    found.form,
+                    *found.size,
                     tuple(spec.channelnames),
                     str(spec.format),
                     spec.get_string_attribute("compression"),
                     own,
                 ),
             )
-        finally:
-            source.close()
-            image._complaint(source)
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror or error}") from error
     except UnicodeError as error:

@@ -332,16 +332,14 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
     written = shading.dictionary(read_manifest(Path(manifest)))
     recipe, source = shading.dictionary(written.get("recipe")), shading.dictionary(written.get("source"))
     item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
-    told: dict[str, float] = {}
-    for name in ("rotate", "exposure"):
-        value = recipe.get(name)
+    turn, exposure = recipe.get("rotate"), recipe.get("exposure")
+    for name, value in (("rotate", turn), ("exposure", exposure)):
         if not isinstance(value, (int, float)):
             raise InputError(f"{manifest} tells no {name}: it is not the manifest of a bake")
-        told[name] = float(value)
     found = environment(
         item,
-        rotate=told["rotate"],
-        exposure=told["exposure"],
+        rotate=float(turn),
+        exposure=float(exposure),  # type: ignore[arg-type]
         nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse",
     )
     if found.digest != source.get("sha256"):
@@ -507,8 +505,24 @@ def render(
 
     Raises their errors, and UnsupportedError for a PNG without matplotlib.
     """
-    output, bound = Path(output), TOLERANCE if tolerance is None else float(tolerance)
-    _check(output, bound, certify, exposure, force)
+    output = Path(output)
+    if output.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"{output} is no name of a picture: it must end with {' or '.join(SUFFIXES)}")
+    low, high = TOLERANCE_RANGE
+    bound = TOLERANCE if tolerance is None else float(tolerance)
+    if not low <= bound <= high:
+        raise UsageError(f"tolerance {bound:g} is outside [{low:g}, {high:g}]")
+    if not 0 <= certify <= 1000:
+        raise UsageError(f"certify {certify} is outside [0, 1000]")
+    if not -shading.EXPOSURES <= exposure <= shading.EXPOSURES:
+        raise UsageError(f"exposure {exposure:g} is outside [{-shading.EXPOSURES:g}, {shading.EXPOSURES:g}]")
+    if output.exists() and not force:
+        raise FileError(f"{output} exists; --force replaces it")
+    if output.suffix.lower() == ".png":
+        from whitefurnace import plot_style
+        from whitefurnace.rendering.figures import draw_side_by_side
+
+        plot_style.require()
     engine, folder, stem = shading.engine_in(manifest, for_)
     lights = shading.read_lights(engine, folder, stem)
     for name, spec in (("dielectric", dielectric), ("metal", metal)):
@@ -533,61 +547,19 @@ def render(
         further=further,
         progress=progress,
     )
-    made = _rendered(output, exposure, bound, multiscatter, engine, lights, env, spheres, shown, lit=bool(further))
-    _write(made, shown)
-    return made
-
-
-def _check(output: Path, tolerance: float, certify: int, exposure: float, force: bool) -> None:
-    """Raise UsageError for numbers outside their ranges, and the errors of a picture that cannot be written."""
-    if output.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"{output} is no name of a picture: it must end with {' or '.join(SUFFIXES)}")
-    low, high = TOLERANCE_RANGE
-    if not low <= tolerance <= high:
-        raise UsageError(f"tolerance {tolerance:g} is outside [{low:g}, {high:g}]")
-    if not 0 <= certify <= 1000:
-        raise UsageError(f"certify {certify} is outside [0, 1000]")
-    if not -shading.EXPOSURES <= exposure <= shading.EXPOSURES:
-        raise UsageError(f"exposure {exposure:g} is outside [{-shading.EXPOSURES:g}, {shading.EXPOSURES:g}]")
-    if output.exists() and not force:
-        raise FileError(f"{output} exists; --force replaces it")
-    if output.suffix.lower() == ".png":
-        from whitefurnace import plot_style
-
-        plot_style.require()
-
-
-def _notices(shown: Shown, tolerance: float, lit: bool) -> list[str]:
-    """Return notices for lights besides the environment (`lit`) and for a missed tolerance."""
-    notices = []
-    if lit:
+    scale = scale_of(shown)
+    notices = [*lights.notices, *env.notices, *spheres.notices]
+    if further:
         notices.append(
             "what lights besides the environment add is the same in both pictures: what differs is the environment's"
         )
-    missed = [f"{r:.3g}" for r, e in zip(shown.roughness, shown.estimates, strict=True) if e > tolerance]
+    missed = [f"{r:.3g}" for r, e in zip(shown.roughness, shown.estimates, strict=True) if e > bound]
     if missed:
         notices.append(
-            f"the tolerance of {tolerance:g} is missed at roughness {', '.join(missed)}: "
+            f"the tolerance of {bound:g} is missed at roughness {', '.join(missed)}: "
             f"{max(shown.estimates):.2g} after {max(shown.samples)} samples a pixel"
         )
-    return notices
-
-
-def _rendered(
-    output: Path,
-    exposure: float,
-    tolerance: float,
-    multiscatter: bool,
-    engine: Engine,
-    lights: Lights,
-    env: Environment,
-    spheres: SphereLayout,
-    shown: Shown,
-    *,
-    lit: bool,
-) -> Rendered:
-    """Return the record of the pictures. lit: whether there are lights besides the environment."""
-    return Rendered(
+    made = Rendered(
         output,
         engine.name,
         shown.engine.shape[1],
@@ -596,10 +568,10 @@ def _rendered(
         spheres.metalness,
         exposure,
         lights.read,
-        (*lights.notices, *env.notices, *spheres.notices, *_notices(shown, tolerance, lit)),
+        tuple(notices),
         spheres.placed(),
         env.digest,
-        tolerance,
+        bound,
         shown.samples,
         shown.estimates,
         shown.certificate,
@@ -607,33 +579,28 @@ def _rendered(
         shown.within(0.5),
         shown.within(MOST),
         multiscatter,
-        scale_of(shown),
+        scale,
         shown.seconds,
     )
-
-
-def _write(made: Rendered, shown: Shown) -> None:
-    """Write the pictures as the layers of an EXR, or as the panels of a PNG."""
-    if made.path.suffix.lower() == ".exr":
+    if output.suffix.lower() == ".exr":
         layers = ("difference", "engine", "truth")  # the order in which readers list them
         write_exr(
-            made.path,
+            output,
             np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
             channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"),
             attributes=_stated(made),
         )
     else:
-        from whitefurnace.rendering.figures import draw_side_by_side
-
         draw_side_by_side(
-            made.path,
-            [shading.srgb(p * 2.0**made.exposure) for p in (shown.engine, shown.truth)],
+            output,
+            [shading.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
             np.where(shown.covered, shown.luminance, np.nan),
-            made.scale,
-            made.engine,
+            scale,
+            engine.name,
             _caption(made),
             {key: str(value) for key, value in _stated(made).items()},
         )
+    return made
 
 
 def _stated(made: Rendered) -> dict[str, str | float | int]:

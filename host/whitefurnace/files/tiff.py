@@ -1,0 +1,219 @@
+"""Reads the directories (tags) of a TIFF or BigTIFF file, and says what its first image states about itself."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from whitefurnace.errors import InputError
+from whitefurnace.files.colour import LINEAR, REC709, SRGB_CURVE, Curve, Encoding, from_primaries
+from whitefurnace.files.icc import MAX_BYTES, read_icc
+
+MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
+
+SUBFILE, BITS, COMPRESSION, PHOTOMETRIC = 254, 258, 259, 262
+_PAGE_LIMIT = 1000
+_VALUE_LIMIT = 1 << 20
+_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "II", 7: "B", 8: "h", 9: "i", 11: "f", 12: "d", 13: "I", 16: "Q", 18: "Q"}
+_READ_PHOTOMETRIC = {0: "MinIsWhite", 1: "MinIsBlack", 2: "RGB", 3: "palette", 6: "YCbCr"}
+_OTHER_PHOTOMETRIC = {
+    4: "a transparency mask",
+    5: "CMYK or other inks",
+    8: "CIE L*a*b*",
+    9: "ICC L*a*b*",
+    10: "ITU L*a*b*",
+    32803: "a colour filter array",
+    32844: "LogL",
+    32845: "LogLuv",
+    34892: "linear raw",
+}
+_WHITE_DEFAULT = REC709[6:]
+
+Values = Sequence[int | float]
+
+
+@dataclass(frozen=True)
+class Tiff:
+    """What the first image of a TIFF states.
+
+    encoding    None where it states none
+    associated  whether colour is multiplied by alpha
+    inverted    whether the largest code is black and OpenImageIO does not turn that round: it does for 8 bits and less
+    """
+
+    encoding: Encoding | None
+    associated: bool
+    inverted: bool
+
+
+def directories(data: mmap.mmap | bytes, wanted: Collection[int]) -> Iterator[dict[int, Values]]:
+    """Yield the tags in `wanted` of each image of a file, of rationals their quotient.
+
+    Raises `struct.error`, `LookupError` or `ValueError` where the file ends too early or its directories form a circle.
+    """
+    order = "<" if data[:1] == b"I" else ">"
+    big = 43 in (data[2], data[3])
+    offset, count, entry, inline = ("Q", "Q", 20, 8) if big else ("I", "H", 12, 4)
+    (at,) = struct.unpack_from(order + offset, data, 8 if big else 4)
+    seen: set[int] = set()
+    while at:
+        if at in seen or len(seen) > _PAGE_LIMIT:
+            raise ValueError("its directories form a circle")
+        seen.add(at)
+        (entries,) = struct.unpack_from(order + count, data, at)
+        at += struct.calcsize(order + count)
+        tags: dict[int, Values] = {}
+        for k in range(min(entries, 65535)):
+            tag, kind, number = struct.unpack_from(order + "HH" + offset, data, at + k * entry)
+            value = at + k * entry + entry - inline
+            form = _TYPES.get(kind)
+            if tag not in wanted or form is None or number > len(data):
+                continue
+            size = struct.calcsize(order + form)
+            if number > _VALUE_LIMIT and form != "B":
+                raise ValueError(f"its tag {tag} has {number} values")
+            if number * size > inline:
+                (value,) = struct.unpack_from(order + offset, data, value)
+            if value + number * size > len(data):
+                raise ValueError(f"its tag {tag} reaches beyond the end of the file")
+            if form == "B":
+                tags[tag] = bytes(data[value : value + number])
+                continue
+            found = struct.unpack_from(f"{order}{number * len(form)}{form[0]}", data, value)
+            if form == "II":
+                found = tuple(a / b if b else float("nan") for a, b in zip(found[::2], found[1::2], strict=True))
+            tags[tag] = found
+        yield tags
+        (at,) = struct.unpack_from(order + offset, data, at + entries * entry)
+
+
+_WANTED = {SUBFILE, BITS, PHOTOMETRIC, 277, 282, 283, 290, 291, 301, 318, 319, 338, 339, 532, 34675}
+
+
+def read_tiff(path: Path) -> Tiff:
+    """Return what the first image of a TIFF states. Raises `InputError` for what is not read."""
+    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        try:
+            pages = list(directories(data, _WANTED))
+        except (struct.error, LookupError, ValueError, OverflowError) as error:
+            said = f" ({error})" if isinstance(error, ValueError) else ""
+            raise InputError(f"{path} is truncated or corrupted: its TIFF directories cannot be read{said}") from None
+    if not pages:
+        raise InputError(f"{path} is a TIFF without an image")
+    _check_pages(pages, path)
+    first = pages[0]
+    _check_samples(first, path)
+    inverted = _whole(first, PHOTOMETRIC, -1) == 0 and _whole(first, BITS, 1) > 8
+    return Tiff(_encoding(first, path), _whole(first, 338, 0) == 1, inverted)
+
+
+def _whole(tags: dict[int, Values], tag: int, default: int) -> int:
+    values = tags.get(tag, ())
+    return int(values[0]) if values and values[0] == values[0] else default
+
+
+def _check_pages(pages: list[dict[int, Values]], path: Path) -> None:
+    """Refuse a first page that is a thumbnail or a mask, and several pages of which none is told apart."""
+    kinds = [_whole(page, SUBFILE, 0) for page in pages]
+    if kinds[0] & 5:
+        what = "a transparency mask" if kinds[0] & 4 else "a copy of reduced size"
+        raise InputError(f"{path} has {what} as the first of its {len(pages)} images, an image was expected there")
+    whole = sum(not kind & 5 for kind in kinds)
+    if whole > 1:
+        raise InputError(f"{path} holds {whole} images of full size, one was expected; save the one that is meant")
+
+
+def _check_samples(tags: dict[int, Values], path: Path) -> None:
+    photometric = _whole(tags, PHOTOMETRIC, -1)
+    if photometric not in _READ_PHOTOMETRIC:
+        name = _OTHER_PHOTOMETRIC.get(photometric, "an unknown kind")
+        known = ", ".join(_READ_PHOTOMETRIC.values())
+        stated = f"the photometric interpretation {photometric} ({name})" if photometric >= 0 else "no interpretation"
+        raise InputError(f"{path} states {stated}, {known} are read; convert it to RGB")
+    bits, formats = set(tags.get(BITS, (1,))), set(tags.get(339, (1,)))
+    if len(bits) > 1 or len(formats) > 1:
+        raise InputError(f"{path} has channels of several depths or kinds, one for all was expected")
+    form, depth = int(formats.pop()), int(bits.pop())
+    if form not in (1, 3):
+        kinds = {2: "signed integers", 4: "undefined data", 5: "complex integers", 6: "complex floats"}
+        kind = kinds.get(form, "unknown")
+        raise InputError(f"{path} states SampleFormat {form} ({kind}), unsigned integers (1) and floats (3) are read")
+    if depth not in ((16, 32, 64) if form == 3 else (1, 2, 4, 8, 10, 12, 14, 16)):
+        raise InputError(
+            f"{path} has {'floats' if form == 3 else 'integers'} of {depth} bits; floats of 16, 32 and 64 and unsigned "
+            "integers of 1 to 16 bits are read"
+        )
+    if form == 3 and photometric == 0:
+        raise InputError(f"{path} holds floats and states that the least is white, the least as black was expected")
+    if 290 in tags or 291 in tags:
+        raise InputError(f"{path} states a curve of optical densities (GrayResponseCurve), which is not read")
+    if 532 in tags and photometric != 6:
+        top = float((1 << depth) - 1)
+        codes = tuple(float(value) for value in tags[532])
+        if codes not in ((0.0, top) * 3, (0.0, top)):
+            shown = " ".join(f"{value:g}" for value in codes[:6])
+            raise InputError(
+                f"{path} states black and white as the codes {shown} (ReferenceBlackWhite), 0 and {top:g} are"
+            )
+    x, y = (tags.get(tag, (1,))[:1] for tag in (282, 283))
+    if x and y and x[0] > 0 and y[0] > 0 and not 0.99 < x[0] / y[0] < 1.01:
+        raise InputError(
+            f"{path} states {x[0]:g} x {y[0]:g} pixels a unit of length; square pixels were expected, or no resolution"
+        )
+
+
+def _encoding(tags: dict[int, Values], path: Path) -> Encoding | None:
+    """Return the encoding of an ICC profile, else that of the tags for curves and primaries."""
+    grey = _whole(tags, PHOTOMETRIC, -1) in (0, 1)
+    if 34675 in tags:
+        data = tags[34675]
+        if not isinstance(data, bytes):
+            raise InputError(f"{path} is corrupted: its ICC profile (tag 34675) is not of bytes")
+        if len(data) > MAX_BYTES:
+            raise InputError(f"{path} holds an ICC profile of over {MAX_BYTES} bytes, which is not read")
+        return read_icc(data, path, "its tag 34675", 1 if grey else 3)
+    curves: tuple[Curve, ...] = ()
+    said = []
+    if 301 in tags:
+        curves = _transfer(tags, path)
+        said.append("TransferFunction")
+    matrix = None
+    if 318 in tags or 319 in tags:
+        xy = (*tags.get(319, REC709[:6]), *tags.get(318, _WHITE_DEFAULT))
+        shown = " ".join(f"{float(value):.4g}" for value in xy[:8])
+        try:
+            if len(xy) != 8 or not all(np.isfinite(xy)):
+                raise ValueError
+            matrix = from_primaries([float(value) for value in xy])
+        except ValueError:
+            raise InputError(f"{path} states primaries ({shown}) that span no colour space") from None
+        said.append(f"PrimaryChromaticities and WhitePoint ({shown})")
+    if not said:
+        return None
+    floats = _whole(tags, 339, 1) == 3
+    if not curves:
+        curves = (LINEAR if floats else SRGB_CURVE,)
+    return Encoding(curves, f"its TIFF tags {' and '.join(said)}", matrix)
+
+
+def _transfer(tags: dict[int, Values], path: Path) -> tuple[Curve, ...]:
+    """Return the curves of the tag TransferFunction: one or three tables of an entry for each code [TIFF 6.0, 20]."""
+    depth = _whole(tags, BITS, 1)
+    count = 1 << depth if depth <= 16 else 0
+    values: npt.NDArray[np.float64] = np.array(tags[301], np.float64)
+    if not count or len(values) not in (count, 3 * count) or _whole(tags, PHOTOMETRIC, -1) in (0, 3):
+        raise InputError(
+            f"{path} has a TransferFunction of {len(values)} entries, one or three tables of 2^{depth} were expected"
+        )
+    grid = np.linspace(0, 1, count)
+    return tuple(_table(grid, table / 65535) for table in values.reshape(-1, count))
+
+
+def _table(grid: npt.NDArray[np.float64], values: npt.NDArray[np.float64]) -> Curve:
+    return Curve("a table", lambda x: np.interp(x, grid, values), bounded=True)
