@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 
 class WhitefurnaceError(Exception):
-    """Base class of every error that this package raises on purpose."""
+    """Base class of every error that this package raises on purpose. `exit_code` is that of the command line."""
 
     exit_code = 1
 

@@ -66,7 +66,7 @@ def drawing(
     size: tuple[float, float] | None = None,
     stated: Mapping[str, str] | None = None,
 ) -> Iterator[Figure]:
-    """Give an empty figure in the common style and write it to `path` as PNG when the block ends.
+    """Yield an empty figure in the common style, and write it to `path` as PNG when the block ends.
 
     The same drawing gives the same bytes; the matplotlibrc of the machine is ignored.
     dpi: dots per inch, DPI by default. size: width and height in inches. stated: texts that are stored in the file.
@@ -193,7 +193,7 @@ def lay_out(figure: Figure, page: Page) -> None:
 
 
 def heading(figure: Figure, title: str, said: str, colour: str) -> None:
-    """Write the title of a page, and the line `said` under it in `colour`."""
+    """Write the title of a page, and the line `said` under it in the colour `colour`."""
     width, height = figure.get_size_inches()
     figure.text(0.25 / width, 1 - 0.2 / height, title, fontsize=18, fontweight="bold", va="top")
     figure.text(0.25 / width, 1 - 0.57 / height, said, fontsize=11, va="top", color=colour)

@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Integrated:
-    """The result of `integrate`.
+    """The result of `integrate`: an array with its estimated error.
 
     values       array of the broadcast shape of the parameters, with a trailing axis for a vector integral
     error        estimated absolute error, the largest over all cells

@@ -1,1 +1,1 @@
-"""Presets: what each game engine loads, and the shader snippets that read it."""
+"""Describes which files each engine loads and how it reads them, and writes the shader snippets that do so."""

@@ -1,4 +1,4 @@
-"""The description of an engine: its files, their layout, its mapping and conventions.
+"""The description of an engine: its files, their layout, its mapping from roughness to lod, and its conventions.
 
 Presets are such descriptions, and so are users' TOML files.
 """
@@ -67,9 +67,11 @@ STORED_NAME = re.compile(r"\{stem\}[A-Za-z0-9_.-]*")
 class File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One file of an engine.
 
-    holds: one of HOLDS. name: "{stem}" with an ending; its suffix is the container. format: pixel format, one of the
-    container's FORMATS and its first where none is given. zstd: level of compression of a .ktx2, 1 to 22.
-    layout: cube, or octahedral maps with `border` texels around each level; of a specular chain alone.
+    holds   content of the file, one of HOLDS
+    name    file name, "{stem}" with an ending; its suffix selects the container
+    format  pixel format, one of the container's FORMATS; the first of them where none is given
+    zstd    level of Zstandard compression of a .ktx2, 1 to 22
+    layout  "cube", or "octahedral" for maps with `border` texels around each level (specular chains only)
     """
 
     holds: Holds
@@ -85,16 +87,18 @@ class File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def stored(self) -> str:
-        """The pixel format, the container's first where none is given."""
+        """The pixel format: the one given, or the container's first."""
         return self.format or FORMATS[self.suffix][0]
 
 
 class Dfg(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """An engine's split-sum table.
 
-    size: texels a side. x, y: the parameter along each axis, one of them NoV. NoV: "centres" has its values at texel
-    centres, "sqrt" has √NoV with its ends on texels. form: (scale, bias), or the multiscatter form (∫Fc, ∫1).
-    charlie: whether Charlie's albedo is a third channel.
+    size     texels on a side
+    x, y     parameter along each axis; one of them is NoV
+    NoV      spacing of NoV: "centres" has values at texel centres, "sqrt" has √NoV with its ends on texels
+    form     "scale_bias" for (scale, bias), or "multiscatter" for (∫Fc, ∫1)
+    charlie  True if Charlie's albedo is a third channel
     """
 
     size: int = 128
@@ -106,25 +110,26 @@ class Dfg(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """What an engine loads and how it reads it.
+    """The files that an engine loads and how it reads them.
 
     name, title: its name in paths and on the command line, and a line that says what it loads.
-    facts: where the rest is from. proven: whether the engine itself has loaded and rendered its files.
-    lod: level that is read at a roughness: a formula of LOD_NAMES, or pairs (r, lod); clamped to the levels there are.
-    follow: whether levels past r = 1 hold a lobe of that α; otherwise they hold that of r = 1.
+    facts: sources of the description. proven: whether the engine itself has loaded and rendered its files.
+    lod: level that is read at a roughness: a formula of LOD_NAMES, or pairs (r, lod); clamped to the existing levels.
+    follow: True if levels past r = 1 hold a lobe of that α; False if they hold the lobe of r = 1.
     axes: "+x +y +z"; the engine reads the stored cube at (±x|y|z, …) for a world direction.
     bend: share of the normal in the direction that is read, mix(mirror direction, normal, bend), a formula of r and
-        alpha.
+    alpha.
     blend: share of the diffuse light E/π at the normal in the radiance, a formula of r and alpha.
-    least: least perceptual roughness that the engine shades with.
-    size, min_size: texels a face edge of the first and the last level, where the user gives none.
-    levels: number of levels, where the engine counts on it.
-    whole: whether it needs all mips down to 1².
+    least: smallest perceptual roughness that the engine shades with.
+    size, min_size: texels of a face edge of the first and the last level, where the user gives none.
+    levels: number of levels, where the engine requires a fixed number.
+    whole: True if the engine needs all mips down to 1².
     sh: scale of its harmonics, one of SH_SCALES; None where it uses none.
-    dfg: its split-sum table. shading: how it weighs what it reads.
+    dfg: its split-sum table. shading: the formula with which it weights what it reads.
     file: its files. steps: what a user does with them.
-    container: "npz" and "exr" hold everything, without `file`. latlong: whether it needs lat-long levels too.
-    without: what "npz" and "exr" leave out (see `reduced`).
+    container: "files", or "npz" and "exr", which hold everything and need no `file`. latlong: True if lat-long levels
+    are needed too.
+    without: parts that "npz" and "exr" leave out (see `reduced`).
     """
 
     name: str = ""
@@ -152,19 +157,21 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
 
     @cached_property
     def lods(self) -> Lods:
-        """The mapping, None in it where it is the default one, whose inverse is closed."""
+        """The mapping from roughness to lod. Its formula is None for the default mapping, whose inverse has a closed
+        form.
+        """
         where = f"{self.name}: lod"
         text = self.lod if isinstance(self.lod, str) else table_text(self.lod, "r", where)
         return Lods(None if text == DEFAULT_LOD else Expression(text, LOD_NAMES, where), self.follow)
 
     @cached_property
     def lod_formula(self) -> Expression:
-        """The mapping as a formula, for shaders."""
+        """The mapping from roughness to lod as a formula, for shaders."""
         return self.lods.lod or Expression(DEFAULT_LOD, LOD_NAMES, f"{self.name}: lod")
 
     @property
     def lods_text(self) -> str:
-        """The mapping for people."""
+        """The mapping from roughness to lod as text for users."""
         return self.lod if isinstance(self.lod, str) else ", ".join(f"{r:g} → {lod:g}" for r, lod in self.lod)
 
     @cached_property
@@ -183,16 +190,16 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
         return axes_matrix(self.axes, f"{self.name}: axes")
 
     def holding(self, holds: str) -> tuple[File, ...]:
-        """Its files that hold `holds`, one of HOLDS."""
+        """Return the engine's files that hold `holds`, one of HOLDS."""
         return tuple(file for file in self.file if file.holds == holds)
 
     @property
     def octahedral(self) -> bool:
-        """Whether its chain is of octahedral maps."""
+        """True if the chain is stored as octahedral maps."""
         return any(file.layout == "octahedral" for file in self.file)
 
     def needs(self, holds: str) -> bool:
-        """Whether a bake for it needs `holds`, one of HOLDS."""
+        """Return whether a bake for this engine needs `holds`, one of HOLDS."""
         if self.container != "files":  # these hold the chain, irradiance, harmonics and the table
             return holds in ("specular", "irradiance", "sh", "dfg") and holds not in self.without
         if holds == "sh":
@@ -200,7 +207,7 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
         return bool(self.holding(holds)) or (holds == "specular" and bool(self.holding("skybox")))
 
     def cubes(self, holds: str) -> bool:
-        """Whether a bake for it needs `holds` as cubes."""
+        """Return whether a bake for this engine needs `holds` as cubes."""
         if holds == "specular" and self.holding("skybox"):
             return True
         return self.needs(holds) and (
@@ -208,7 +215,7 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
         )
 
     def data(self) -> dict[str, Any]:
-        """The description as plain data, which is part of a bake's key."""
+        """Return the description as plain data, which is part of a bake's key."""
         data: dict[str, Any] = msgspec.to_builtins(self)
         if not self.without:
             del data["without"]
@@ -221,7 +228,7 @@ _AXIS = {"x": 0, "y": 1, "z": 2}
 
 
 def axes_matrix(text: str, where: str = "axes") -> tuple[tuple[int, int, int], ...]:
-    """The signed permutation of "+x +y -z". Raises UsageError."""
+    """Return the signed permutation matrix of axes such as "+x +y -z". Raises UsageError, with `where` as the place."""
     found = re.fullmatch(r"\s*([+-]?)([xyz])[\s,]+([+-]?)([xyz])[\s,]+([+-]?)([xyz])\s*", text)
     rows = [] if found is None else [(found[k] == "-", _AXIS[found[k + 1]]) for k in (1, 3, 5)]
     if sorted(axis for _, axis in rows) != [0, 1, 2]:
@@ -236,20 +243,20 @@ READ_IN_COPIES = "from third-party copies of its shaders"
 
 @dataclass(frozen=True)
 class Published:
-    """Numbers that the engine's own sources give at perceptual roughness 1/2, where alpha is 1/4.
+    """Numbers from the engine's own sources at perceptual roughness 1/2, where alpha is 1/4.
 
-    They are worked out by hand and not from the preset's formulas, which tests hold against them.
+    They are worked out by hand and not from the preset's formulas, so that tests can compare the formulas with them.
 
-    levels, width: number of levels and texels a face edge of the chain that the numbers are for.
+    levels, width: number of levels and texels of a face edge of the chain that the numbers are for.
     lod: level that is read.
     bend: share of the normal in the direction that is read, 0 to 1.
     blend: share of the diffuse light in the radiance, 0 to 1.
-    direction: for each axis of the stored direction, the world axis that it is, 1 to 3, negative where it points
-        against it.
-    table: place (u, v) in the split-sum table at NoV = 0.3; None where the engine is given no table.
-    form: whether the table holds (scale, bias) or the multiscatter form (∫Fc, ∫1).
+    direction: for each axis of the stored direction, the world axis that it equals, 1 to 3, negative where it points
+    the other way.
+    table: place (u, v) in the split-sum table at NoV = 0.3; None where the engine gets no table.
+    form: "scale_bias" or "multiscatter", the form of the table.
     diffuse_lod: level whose radiance along the normal is the diffuse light; None where there are harmonics or an
-        irradiance cube.
+    irradiance cube.
     """
 
     levels: int
@@ -268,8 +275,9 @@ class Preset:
     """One preset, as a module of `engines/presets` states it.
 
     order: place in lists, smaller first.
-    engine: what the engine loads. Its name is the module's.
-    published: what tests hold the engine's formulas against; needed of every engine whose container is "files".
+    engine: the description of the engine. Its name is that of the module.
+    published: numbers that tests compare with the engine's formulas; required for every engine whose container is
+    "files".
     """
 
     order: int
@@ -283,9 +291,10 @@ table."""
 
 
 def reduced(engine: Engine, without: Sequence[str] = (), table: int | None = None) -> Engine:
-    """An engine that is given fewer parts, or a split-sum table of another size.
+    """Return an engine that gets fewer parts, or a split-sum table of another size.
 
-    without: names of REDUCIBLE. table: texels a side, 1 to 4096; its own where it is None.
+    without: parts to leave out, names of REDUCIBLE. table: texels on a side, 1 to 4096; None keeps the engine's own
+    size.
     Raises UsageError for a part that cannot be left out.
     """
     for holds in without:
@@ -317,7 +326,7 @@ def reduced(engine: Engine, without: Sequence[str] = (), table: int | None = Non
 
 
 def check(engine: Engine) -> None:
-    """Check what the types of a description do not say. Raises UsageError."""
+    """Check those properties of a description that its types do not express. Raises UsageError."""
     name = engine.name
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]*", name):
         raise UsageError(f"{name!r} cannot name an engine: letters, digits, _, . and - can")

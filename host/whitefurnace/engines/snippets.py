@@ -1,5 +1,4 @@
-"""About twenty lines of GLSL, HLSL or WGSL that read an engine's files as its preset says: the contract between a bake
-and a shader, written out of the same data."""
+"""Writes a shader snippet in GLSL, HLSL or WGSL that reads an engine's files, from the preset that describes them."""
 
 from __future__ import annotations
 
@@ -34,12 +33,12 @@ MONOMIALS = (
 
 
 def _line(text: str) -> str:
-    """What may stand in a comment: one line, and no backslash at its end, which would take in the next."""
+    """Return text for a comment: one line, without a backslash at its end, which would continue the comment."""
     return " ".join(text.split()).rstrip("\\")
 
 
 class _Writer:
-    """Lines of one language, from functions of named expressions; the few things that differ between them."""
+    """Writes lines of one shading language from named expressions; it knows how the languages differ."""
 
     def __init__(self, language: str) -> None:
         self.language, self.type = language, TYPES[language]
@@ -50,7 +49,7 @@ class _Writer:
         self.lines.append(f"// {_line(text)}")
 
     def resource(self, kind: str, name: str, remark: str) -> None:
-        """A texture ("cube", "2d"), the sampler or nine vectors ("sh"), at the next binding of group 0."""
+        """Declare a texture ("cube", "2d"), the sampler or nine vectors ("sh") at the next binding of group 0."""
         glsl = {"cube": "uniform samplerCube {};", "2d": "uniform sampler2D {};", "sh": "uniform vec3 {}[9];"}
         hlsl = {
             "cube": "TextureCube {};",
@@ -95,7 +94,7 @@ class _Writer:
         value: str,
         remark: str = "",
     ) -> None:
-        """`first` are (type, name, expression) that `value` may use."""
+        """Write a function; `first` has (type, name, expression) of variables that `value` may use."""
         if self.language == "wgsl":
             head = f"fn {name}({', '.join(f'{n}: {self.type[t]}' for t, n in takes)}) -> {self.type[result]} {{"
         else:
@@ -108,13 +107,17 @@ class _Writer:
 
 
 def snippet(engine: Engine, language: str, levels: int, width: int, stem: str = "") -> str:
-    """A shader's part that reads a bake for `engine` of `levels` levels, the first of width² texels, in "glsl" (3.00 ES
-    and newer), "hlsl" (shader model 4 and newer) or "wgsl".
+    """Return a part of a shader that reads a bake for `engine`.
 
-    It declares the textures and defines specular_lod(r), specular_direction(n, v, r), specular_radiance(n, v, r),
-    irradiance(n), which is E/π, and where there is a table dfg(NoV, r), its texel as it is, and specular_albedo(F0,
-    NoV, r), which is E = F0·A + B whatever form the table has. r is perceptual roughness. Raises UnsupportedError for
-    an engine that is given no chain, UsageError for another language.
+    language: "glsl" (3.00 ES and newer), "hlsl" (shader model 4 and newer) or "wgsl". levels: number of levels. width:
+    texels of a face edge of level 0. stem: stem of the files, for comments.
+
+    The snippet declares the textures and defines these functions of unit vectors and the perceptual roughness r:
+    specular_lod(r), specular_direction(n, v, r), specular_radiance(n, v, r), and irradiance(n), which is E/π. Where
+    there is a table it also defines dfg(NoV, r), the texel as stored, and specular_albedo(F0, NoV, r) = F0·A + B,
+    whatever form the table has.
+
+    Raises UnsupportedError for an engine that gets no chain, and UsageError for another language.
     """
     if language not in LANGUAGES:
         raise UsageError(f"unknown shading language {language!r}{nearest(language, LANGUAGES)}")

@@ -87,7 +87,7 @@ class Comparison:
     notices: tuple[str, ...]
 
     def beyond(self, bound: float) -> Row | None:
-        """Return the row that exceeds a bound the most, or None."""
+        """Return the row that exceeds `bound` the most, or None where no row exceeds it."""
         worst = max(self.rows, key=lambda row: row.bounded)
         return worst if not worst.bounded <= bound else None
 
@@ -105,11 +105,11 @@ def axes_of(text: str) -> np.ndarray:
 def compare(a: Contents, b: Contents, *, axes_a: str | None = None, axes_b: str | None = None) -> Comparison:
     """Compare `a` with the reference `b`.
 
-    Levels are matched by size, and by roughness where both files state it. Where no size is common, the first levels
-    are compared: by the means of the finer over the texels of the coarser (exact overlaps), or, where that takes too
-    long or a level is not of roughness 0, by a bilinear read of A at the texel centres of B. A notice says which.
-    Arrays are compared layer by layer.
-    axes_a, axes_b: the axes that a file is stored in, where they are not ours (`axes_of`).
+    Levels are matched by size, and by roughness where both files state it. If no size is common, the first levels are
+    compared: by the means of the finer level over the texels of the coarser one (exact overlaps), or, if that takes too
+    long or a level is not of roughness 0, by a bilinear read of A at the texel centres of B. A notice states the
+    method. Arrays are compared layer by layer.
+    axes_a, axes_b: the axes in which a file is stored, where they differ from ours (`axes_of`).
     Raises UsageError for invalid axes, and UnsupportedError for contents that cannot be compared.
     """
     notices: list[str] = []

@@ -118,7 +118,7 @@ class Contents:
     def written_for(self) -> tuple[str, str] | None:
         """The engine that the file was written for, and its axes; None where neither manifest nor keys state them.
 
-        The axes of a user's engine are those that the bake received.
+        For a user's own engine the axes are those that the bake got.
         """
         stated = self.statement.stated if self.statement is not None else {}
         name = self.keys.get(f"{PREFIX}engine", stated.get("engine"))
@@ -707,7 +707,7 @@ def _weights(found: Contents, level: Level) -> np.ndarray:
 
 
 def described(found: Contents) -> dict[str, Any]:
-    """Return all facts about the contents as plain data, for a row of JSON, with `statistics` and `looks_like`."""
+    """Return all facts about the contents as plain data for a row of JSON, with `statistics` and `looks_like`."""
     parts = [*found.levels, *(part for part in (found.irradiance, found.dfg) if part is not None)]
     return {
         "event": "contents",

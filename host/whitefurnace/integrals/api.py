@@ -1,6 +1,6 @@
-"""The public `integrate`, for integrals of a BRDF alone and for reflected radiance.
+"""The public function `integrate`, for integrals of a BRDF alone and for reflected radiance.
 
-Reflected radiance reads images, so its module is imported when it is first asked for.
+Reflected radiance needs image readers, so its module is imported at its first use.
 """
 
 from __future__ import annotations

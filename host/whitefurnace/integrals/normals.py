@@ -1,4 +1,4 @@
-"""Draws microfacet normals from any NDF: by its own quantile where it has one, else by a table of its energy."""
+"""Draws microfacet normals from any NDF: by its own quantile function where it has one, otherwise by a table."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def sample(
     """Draw `count` normals m with density D(m)(n·m): (count, 3) float64, n = +z.
 
     ndf: a name (`ggx`, `ggx:alpha=.3`), a catalogue entry or the path of a `.clh` file.
-    count: how many, 1 to 2^28.
+    count: number of normals, 1 to 2^28.
     seed: the same seed gives the same normals.
-    device, precision: NDFs with a closed quantile are sampled by it on the device in float32 or float64, the others
-      through a table of their energy.
-    parameters: those of the NDF, one number each.
+    device, precision: an NDF whose quantile function has a closed form is sampled on the device, in 32 or 64 bits;
+    others are sampled by a table of their cumulative distribution.
+    parameters: the parameters of the NDF, one number each.
 
-    Raises what `integrate` raises.
+    Raises the errors of `integrate`.
     """
     choice = chosen("ndf", ndf)
     entry = choice.model
@@ -79,7 +79,7 @@ def sample(
 def quantiles(device: Device, entry: Model, numbers: np.ndarray, u: np.ndarray, precision: int = 32) -> np.ndarray:
     """Return sin²θ, (n,) float64, at the quantiles u of an isotropic NDF's density D(m)(n·m).
 
-    numbers: (k, 1) parameters and constants as kernels take them. u: (n,) in [0, 1).
+    numbers: (k, 1) parameters and constants as kernels take them. u: (n,) in [0, 1). precision: 32 or 64 bits.
     """
     if "NDF_SAMPLE" in entry.provides:
         return _closed(device, entry, u, numbers, precision)

@@ -25,9 +25,10 @@ HORIZON = 1e-3
 
 @dataclass(frozen=True)
 class Pieces:
-    """Pieces of outlines: vectors C, A, B (n, 3), their ends in t (n,), and the cell that each belongs to.
+    """Pieces of outlines of area lights.
 
-    The light is on the left as azimuths run.
+    Each piece is a curve P(t) = C + A cos t + B sin t: vectors C, A, B (n, 3), the ends of t (n,), and the index of its
+    cell. The light lies to the left of a piece as the azimuth grows.
     """
 
     C: np.ndarray
@@ -123,9 +124,9 @@ def _disc(center: np.ndarray, normal: np.ndarray, radius: np.ndarray) -> Pieces:
 
 
 def outline(light: str, numbers: Mapping[str, np.ndarray]) -> Pieces:
-    """Return the pieces of a light's outline for cells of parameters (n,) by name.
+    """Return the pieces of a light's outline above the horizon, for cells of parameters (n,) by name.
 
-    light: "disc" or "rectangle". There are none where the light shines away or is below the horizon.
+    light: "disc" or "rectangle". A cell whose light faces away or is below the horizon has no pieces.
     """
 
     def vector(name: str) -> np.ndarray:
@@ -195,10 +196,10 @@ def _crossing(pieces: Pieces, direction: np.ndarray, level: np.ndarray | float =
 def panels(
     pieces: Pieces, NoV: np.ndarray, phi: np.ndarray, widths: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows (11, m) of panels, as `source.OUTLINE` names them, and the cell of each, sorted.
+    """Return rows (11, m) of quadrature panels, as `source.OUTLINE` names them, and the cell of each panel, sorted.
 
-    NoV, phi: the views of the cells, (n,). widths: (n, 2) of the lobe along x and y; None for a diffuse model, whose
-    kinks lie across the view's azimuth and at its polar angle.
+    NoV, phi: views of the cells, (n,) each; phi in radians. widths: (n, 2) widths of the lobe along x and y; None for a
+    diffuse model, whose kinks lie across the view's azimuth and at its polar angle.
     """
     if not len(pieces.cell):
         return np.empty((11, 0)), np.empty(0, int)

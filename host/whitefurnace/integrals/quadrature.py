@@ -65,7 +65,7 @@ def integrate(
 ) -> Integrated:
     """Integrate a BRDF over all broadcast `parameters`; `whitefurnace.integrate` documents the arguments.
 
-    name: any integral but radiance. Raises what `whitefurnace.integrate` raises.
+    name: any integral but radiance. Raises the errors of `whitefurnace.integrate`.
     """
     start = time.perf_counter()
     if precision not in (32, 64):
@@ -110,7 +110,10 @@ def integrate(
 
 
 def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
-    """Yield a notice where the tolerance is missed by more than the rounding of a value of 1 and as much again."""
+    """Yield a notice where the error misses the tolerance by more than twice the rounding of a value of 1.
+
+    precision: 32 or 64 bits.
+    """
     if not error <= 2 * max(tolerance, ROUNDING[precision]):
         yield f"the error of {error:.2g} is over the tolerance of {tolerance:g}: the finest rule did not reach it"
 
@@ -131,10 +134,14 @@ def _of_files(parts: Sequence[Part], flat: np.ndarray) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class TableSpec:
-    """What `integrate` would compute with the same arguments.
+    """A description of the array that `integrate` would compute with the same arguments.
 
-    entry, slots: the integral and the models by slot. shape: that of `values`. digests: those of the kernels.
-    `precision`, `tolerance`, `device`, `out` and `progress` do not change it.
+    entry    the integral
+    slots    models by slot
+    shape    shape of `values`
+    digests  digests of the kernels
+
+    The arguments `precision`, `tolerance`, `device`, `out` and `progress` do not change it.
     """
 
     entry: Integral
@@ -154,9 +161,9 @@ def table_spec(
     backfacing: str | None = None,
     **parameters: Any,
 ) -> TableSpec:
-    """Check the arguments of `integrate` without a device, and return what it would compute.
+    """Check the arguments of `integrate` without a device, and describe what it would compute.
 
-    Raises what `integrate` raises for its arguments.
+    Raises the errors of `integrate` for its arguments.
     """
     entry = integral(name)
     _refuse_lit(entry)
@@ -171,7 +178,10 @@ def table_spec(
 
 
 def room_for(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> np.ndarray:
-    """Return the array for the values: `out`, or a new one. Raises UsageError where `out` does not fit."""
+    """Return the array for the values: `out`, or a new one of `shape`.
+
+    precision: 32 or 64 bits. Raises UsageError for an `out` of another shape or dtype.
+    """
     if out is None:
         return np.empty(shape, np.dtype(f"f{precision // 8}"))
     if out.shape != shape or not out.flags.c_contiguous or out.dtype.kind != "f":
@@ -190,9 +200,9 @@ def _refuse_lit(entry: Integral) -> None:
 def slots_of(
     entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec, diffuse: Spec | None, brdf: Spec | None
 ) -> dict[str, Chosen]:
-    """Return the models of the slots that an integral needs. A slot that it does not need is not compiled in.
+    """Return the models of the slots that an integral needs. Other slots are not compiled in.
 
-    Raises UsageError and UnsupportedError for models that do not go together or that the integral has no use for.
+    Raises UsageError and UnsupportedError for models that do not fit together or that the integral does not use.
     """
     albedo = entry.name in ("albedo", "albedo_average", "radiance")
     if not albedo and (diffuse is not None or brdf is not None):
@@ -225,9 +235,10 @@ def slots_of(
 
 @dataclass(frozen=True)
 class Grid:
-    """Broadcast columns of numbers by name (`NoV`, `ndf_alpha`), read in parts: no array of the grid's size is made.
+    """Broadcast columns of numbers by name (`NoV`, `ndf_alpha`), read in parts: no array of the grid's size exists.
 
-    shape: the broadcast shape. rgb: whether the last axis is that of the channels.
+    shape  the broadcast shape
+    rgb    True if the last axis is that of the RGB channels
     """
 
     shape: tuple[int, ...]
@@ -240,7 +251,7 @@ class Grid:
         return int(np.prod(self.shape, dtype=np.int64))
 
     def part(self, name: str, begin: int, end: int) -> np.ndarray:
-        """Return cells [begin, end) of a column, float64."""
+        """Return cells `begin` to `end` - 1 of a column, float64."""
         column = self.columns[name]
         return (
             np.full(end - begin, float(column))
@@ -249,7 +260,9 @@ class Grid:
         )
 
     def rows(self, part: Part, begin: int, end: int) -> np.ndarray:
-        """Return the parameter rows of one part of the BRDF for cells [begin, end), view first: (rows, end - begin)."""
+        """Return the parameters of one part of the BRDF for cells `begin` to `end` - 1: (rows, end - begin), view
+        first.
+        """
         names = [*part.view, *(f"{slot}_{p.name}" for slot, m in part.slots.items() for p in m.parameters)]
         return np.stack([self.part(name, begin, end) for name in names])
 
@@ -257,8 +270,8 @@ class Grid:
 def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any], backfacing: str | None) -> Grid:
     """Return every number that the kernels need, checked against its domain, with the broadcast shape.
 
-    given: the parameters by name; those used are taken out. Raises UsageError for numbers outside their domain, unknown
-    or missing names, and shapes that do not broadcast.
+    given: the parameters by name; those that are used are removed from it. Raises UsageError for numbers outside their
+    domain, unknown or missing names, and shapes that do not broadcast.
     """
     columns: dict[str, Any] = {}
     rgb: set[str] = set()
@@ -355,10 +368,11 @@ def _view(given: Any, backfacing: str | None) -> np.ndarray:
 
 @dataclass
 class Part:
-    """One summand of the BRDF on a device: the specular one, the diffuse one or a user's whole one.
+    """One summand of the BRDF on a device: the specular one, the diffuse one or a user's whole BRDF.
 
-    closed: the file of a kernel that it has of its own. areas: tables of Smith's area by precision. norms: the least
-    and the largest norm of a user's NDF so far.
+    closed  kernel file of an integral that has its own, or None
+    areas   tables of Smith's area by precision
+    norms   smallest and largest norm of a user's NDF so far
     """
 
     device: Device
@@ -371,7 +385,7 @@ class Part:
 
     @property
     def kind(self) -> str:
-        """The family of rules that it is integrated by: a key of `LADDERS`."""
+        """Key of `LADDERS`: the sequence of rules with which this part is integrated."""
         if self.closed:
             return "light-angles"
         if "ndf" in self.slots:
@@ -387,19 +401,19 @@ class Part:
 
     @property
     def components(self) -> int:
-        """Numbers of one value."""
+        """Number of components of one value."""
         return 3 if self.kind == "half-vectors" else self.entry.components
 
     @property
     def tabulated(self) -> bool:
-        """Whether the masking reads Smith's area from a table."""
+        """True if the masking reads Smith's area from a table."""
         needs = {f for m in self.slots.values() for f in m.needs}
         return "NDF_AREA" in needs and "NDF_AREA" not in self.slots["ndf"].provides
 
     def cells(self, rows: np.ndarray, precision: int, tolerance: float = 0.0) -> tuple[np.ndarray, int, float]:
         """Return rows as kernels read them, the length of the table of Smith's area, and the error of that table.
 
-        rows: view and parameters, (k, n) float64. tolerance: what the table may be off by, ten times.
+        rows: view and parameters, (k, n) float64. tolerance: ten times the largest error that the table may have.
         """
         count = len(self.view)
         read, out, ndf = count, [rows[:count]], None
@@ -425,15 +439,15 @@ class Part:
 
     @property
     def ladder(self) -> tuple[Rule, ...]:
-        """The rules that the integral climbs, from the coarsest."""
+        """The rules of this part, from the coarsest to the finest."""
         return LADDERS[self.kind]
 
     def lanes(self, cells: np.ndarray) -> int:
-        """Return how many integrals the kernel sums for these cells."""
+        """Return the number of integrals that the kernel sums for these cells."""
         return cells.shape[1]
 
     def text(self, terms: int) -> str:
-        """Return the kernel text, with a table of Smith's area of `terms` terms."""
+        """Return the kernel text for a table of Smith's area of `terms` terms."""
         return (source.closed(self.closed, self.slots) if self.closed else _program(self.entry, self.slots, terms)).text
 
     def sum(self, cells: np.ndarray, terms: int, rule: Rule, precision: int) -> np.ndarray:
@@ -449,7 +463,7 @@ def _program(entry: Integral, slots: Mapping[str, Model], terms: int) -> source.
 
 
 def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
-    """Return the kernel file that an integral has of its own for these models, or None."""
+    """Return the kernel file that is written for this integral and these models alone, or None."""
     if "ndf" not in slots or any(m.text is not None for m in slots.values()):
         return None
     names = [m.name for m in slots.values()]
@@ -457,7 +471,7 @@ def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
 
 
 def summands_of(slots: Mapping[str, Chosen]) -> list[dict[str, Model]]:
-    """Return the models of each summand of the BRDF: the specular one, the diffuse one or a user's whole one."""
+    """Return the models of each summand of the BRDF: the specular one, the diffuse one or a user's whole BRDF."""
     specular = {slot: c.model for slot, c in slots.items() if slot in ("ndf", "masking", "fresnel")}
     return [
         some
@@ -473,10 +487,12 @@ def parts_of(device: Device, entry: Integral, slots: Mapping[str, Chosen], preci
 
 @dataclass
 class Totals:
-    """Totals of a run.
+    """Running totals of an integration.
 
-    error: the largest estimated error. evaluations: evaluations of the integrand. rule: the finest rule used. promoted:
-    cells that were done in float64 after float32 missed the tolerance.
+    error        largest estimated error
+    evaluations  evaluations of the integrand
+    rule         finest rule used
+    promoted     number of cells that were computed in float64 after float32 missed the tolerance
     """
 
     error: float = 0.0
@@ -491,7 +507,7 @@ class Totals:
             self.rule = rule
 
     def notices(self) -> tuple[str, ...]:
-        """Return the sentence about promoted cells, where there are any."""
+        """Return a sentence about promoted cells, or nothing where there are none."""
         return (
             (f"{self.promoted} cells were done in float64: float32 did not reach the tolerance there",)
             if self.promoted
@@ -501,10 +517,11 @@ class Totals:
 
 @np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
 def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precision: int | None = None) -> np.ndarray:
-    """Integrate cells by finer and finer rules until two neighbouring ones agree: (components, n).
+    """Integrate cells by finer and finer rules until two neighbouring rules agree: (components, n).
 
-    Every block of cells goes on until it agrees within `tolerance`; `totals` takes note of error and work. Raises
-    CheckError where values are not finite.
+    rows: view and parameters, (k, n). tolerance: largest absolute difference of the two rules; each block of cells
+    continues until all of its cells agree. totals: gets the error and the work. precision: 32 or 64 bits, None for that
+    of the part. Raises CheckError for values that are not finite.
     """
     precision = precision or part.precision
     ladder = part.ladder
@@ -626,12 +643,12 @@ def dfg(
 ) -> Integrated:
     """Compute the split-sum table of a specular BRDF: `values` (size, size, 2) as [y, x, (scale, bias)].
 
-    size: texels an edge, 1 to 4096. x is n·v = (x + ½)/size, and y is perceptual roughness r = (y + ½)/size, α = r²,
-      with the smoothest in row 0.
+    size: texels on an edge, 1 to 4096. x is n·v = (x + ½)/size, and y is perceptual roughness r = (y + ½)/size, α = r²,
+    with the smoothest in row 0.
     ndf, masking: models, as in `integrate`. E(v; F0) = F0·scale + bias for Schlick's Fresnel with F90 = 1.
     tolerance, precision, device: as in `integrate`.
 
-    Raises what `integrate` raises.
+    Raises the errors of `integrate`.
     """
     if not 1 <= size <= 4096:
         raise UsageError(f"dfg size {size} is outside [1, 4096]")
@@ -653,8 +670,8 @@ def dfg(
 def rows_of_roughness(choice: Chosen, r: np.ndarray) -> dict[str, np.ndarray]:
     """Return the parameters of a model that follow perceptual roughness, by name, at roughnesses of any shape.
 
-    Parameters that were given with the model are held and are not among them. Raises UnsupportedError for a model
-    without any that follows roughness.
+    r: perceptual roughness in [0, 1]. Parameters that were given with the model are fixed and not returned. Raises
+    UnsupportedError for a model without any parameter that follows roughness.
     """
     entry = choice.model
     if entry.from_roughness is None:

@@ -112,7 +112,7 @@ def radiance(
     progress: Progress | None = None,
     **parameters: Any,
 ) -> Integrated:
-    """Compute reflected radiance; `whitefurnace.integrate` documents arguments, values and errors."""
+    """Compute reflected radiance; `whitefurnace.integrate` documents the arguments, values and errors."""
     start = time.perf_counter()
     if precision not in (32, 64):
         raise UsageError(f"precision {precision} is not one of 32, 64")
@@ -177,7 +177,10 @@ def radiance_spec(
     backfacing: str | None = None,
     **parameters: Any,
 ) -> TableSpec:
-    """Return what `radiance` would compute with the same arguments; without a light, for an environment."""
+    """Describe the array that `radiance` would compute with the same arguments.
+
+    light: None for a radiance that comes from an environment. Raises the errors of `radiance` for its arguments.
+    """
     entry, slots = integral("radiance"), _chosen(light, ndf, masking, fresnel, diffuse, brdf)
     shape = grid_of(entry, slots, dict(parameters), backfacing).shape
     return TableSpec(entry, slots, (*shape, 3) if light is None or "brdf" in slots else shape, (source.everything(),))
@@ -505,10 +508,10 @@ def _environment_of(
 
 
 def frame_of(normal: Sequence[float]) -> np.ndarray:
-    """Return the frame of a surface with this normal in the world: (3, 3), rows are the local x, y, z.
+    """Return the frame of a surface with this normal in the world: (3, 3), whose rows are the local x, y, z.
 
-    z is the normal; x and y are +X and -Z, turned as +Y turns to the normal on the shortest way (about +X where that is
-    to -Y).
+    z is the normal. x and y are +X and -Z under the shortest rotation from +Y to the normal (about +X where the normal
+    is -Y).
     """
     try:
         n = np.asarray(normal, np.float64)

@@ -1,1 +1,1 @@
-"""Devices, assembled kernel text and launches: the only door to pyopencl."""
+"""Devices, assembled kernel text and launches: the only package that imports pyopencl."""

@@ -15,7 +15,7 @@ from whitefurnace.catalogue import Model
 
 
 class Kind(Enum):
-    """What a kernel function takes as one of its own parameters."""
+    """The kinds of a kernel function's own parameters."""
 
     NUMBER = "number"
     """One `real`."""
@@ -36,9 +36,9 @@ _PAIR_OF_DIRECTIONS = {"NoV": NUMBER, "NoL": NUMBER, "NoH": NUMBER, "VoH": NUMBE
 class Function:
     """A function that the models of a slot provide.
 
-    ending: the end of its name in a kernel file, `D` in `ndf_ggx_D`.
-    parameters: its own parameters in order, by name; the numbers of the model follow them.
-    anisotropic: the parameters that take their place where the NDF is anisotropic; None where nothing changes.
+    ending: end of its name in a kernel file, `D` in `ndf_ggx_D`.
+    parameters: names of its own parameters in order; the numbers of the model follow them.
+    anisotropic: the parameters that replace them where the NDF is anisotropic; None where nothing changes.
     """
 
     ending: str
@@ -46,7 +46,10 @@ class Function:
     anisotropic: Mapping[str, Kind] | None = None
 
     def kinds(self, isotropic: bool) -> tuple[Kind, ...]:
-        """Return the kinds of its own parameters, NUMBER or VECTOR, beside an NDF that is isotropic or not."""
+        """Return the kinds of the function's own parameters, NUMBER or VECTOR.
+
+        isotropic: True if the NDF of the program is isotropic.
+        """
         chosen = self.parameters if isotropic or self.anisotropic is None else self.anisotropic
         here = NUMBER if isotropic else VECTOR
         return tuple(here if kind is DIRECTION else kind for kind in chosen.values())
@@ -86,7 +89,7 @@ Declared = tuple[str, str]
 
 
 def is_isotropic(slots: Mapping[str, Model]) -> bool:
-    """Return whether the models of a program know no azimuth: there is no NDF, or it is isotropic."""
+    """Return whether the models of a program do not depend on the azimuth: there is no NDF, or it is isotropic."""
     return "ndf" not in slots or slots["ndf"].isotropic
 
 
@@ -95,10 +98,10 @@ def bindings(slots: Mapping[str, Model], *, cells: Sequence[str] = ("NoV",), are
 
     slots: the models of the program, in the order in which a cell holds their numbers.
     cells: names of the numbers that a cell holds before those of the models.
-    area_terms: length of the tabulated Smith area that a cell holds after those of the models; 0 for no table.
+    area_terms: length of the table of Smith's area that a cell holds after them; 0 for no table.
 
-    Lists begin with a comma, so that a model without parameters leaves nothing behind. A slot whose model needs another
-    slot's function carries the parameters of that slot too.
+    Lists begin with a comma, so that a model without parameters adds nothing. A slot whose model calls a function of
+    another slot also has the parameters of that slot.
     """
     isotropic = is_isotropic(slots)
     own: dict[str, list[Declared]] = {

@@ -52,5 +52,5 @@ def anterpolation_defines() -> str:
 
 
 def class_defines() -> str:
-    """Return the `#define` lines of `octahedral.cl`: the edges of tiles and runs, and how many classes they hold."""
+    """Return the `#define` lines of `octahedral.cl`: edges of tiles and runs, and the numbers of classes in them."""
     return f"#define TILE_EDGE {TILE_EDGE}\n#define RUN_EDGE {RUN_EDGE}\n#define TILE {TILE}\n#define RUN {RUN}\n"

@@ -1,4 +1,4 @@
-"""Numbers that kernels need beside a model's parameters: constants, a user's norm, tables of Smith's area."""
+"""Numbers that kernels need in addition to a model's parameters: constants, a user's norm, tables of Smith's area."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ by 5 % from one to the next."""
 class AreaTable:
     """A table of Smith's projected area of several NDFs, as kernels read it.
 
-    rows: (3 + length, n) scale, 1/range, A(0) and `length` terms of a series, one column an NDF. error: the error of
-    the area relative to the area.
+    rows   (3 + length, n): scale, 1/range, A(0) and `length` terms of a series, one column for each NDF
+    error  largest error of the area relative to the area
     """
 
     rows: np.ndarray
@@ -42,7 +42,9 @@ class AreaTable:
 
 
 def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the distinct columns of (k, n) numbers as (k, m), and for each of the n columns the index of its own."""
+    """Return the distinct columns (k, m) of an array (k, n), and for each of the n columns the index of its distinct
+    one.
+    """
     if rows.shape[1] == 0 or rows.shape[0] == 0 or (rows == rows[:, :1]).all():
         return rows[:, :1], np.zeros(rows.shape[1], np.intp)
     # Grids come in runs of equal columns: sorting their heads alone is many times quicker.
@@ -52,9 +54,9 @@ def unique_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def numbers_of(device: Device, entry: Model, rows: np.ndarray) -> np.ndarray:
-    """Return the numbers that kernels take of a model: parameters and constants, (k + c, n) float64.
+    """Return the numbers of a model that kernels take: parameters and constants, (k + c, n) float64.
 
-    rows: the parameters, (k, n) float64, one column a cell. Raises InputError for a user's NDF that cannot be
+    rows: the parameters, (k, n) float64, one column for each cell. Raises InputError for a user's NDF that cannot be
     normalized.
     """
     if not entry.constant_names:
@@ -71,7 +73,7 @@ def numbers_of(device: Device, entry: Model, rows: np.ndarray) -> np.ndarray:
 
 
 def finest(device: Device) -> int:
-    """Return the precision, 32 or 64, in which tables and norms are made: the finest that the device has."""
+    """Return the precision, 32 or 64 bits, in which tables and norms are made: the finest that the device supports."""
     return 64 if device.fp64 else 32
 
 
@@ -108,23 +110,23 @@ def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.nd
 
 
 def refuse_bad(entry: Model, D: np.ndarray, theta: np.ndarray) -> None:
-    """Raise InputError where a user's D is NaN, infinite or negative at one of the angles theta, in radians."""
+    """Check that a user's D is finite and not negative at angles theta, in radians. Raises InputError."""
     for bad, what in ((~np.isfinite(D), "not finite"), (D < 0, "negative")):
         if bad.any():
             raise InputError(f"{entry.path}: cannot be normalized: D is {what} at θ = {theta[bad.argmax()]:.4g} rad")
 
 
 class Areas:
-    """Makes the tables of Smith's area of one NDF, once for each set of parameters."""
+    """Makes the tables of Smith's area of one NDF, each set of parameters once."""
 
     def __init__(self, device: Device, entry: Model, precision: int) -> None:
         self.device, self.entry, self.precision = device, entry, precision
         self._made: dict[bytes, tuple[np.ndarray, float]] = {}
 
     def table(self, rows: np.ndarray, tolerance: float = 0.0) -> AreaTable:
-        """Return the table for cells of numbers (k, n), with as many terms as a tenth of `tolerance` needs.
+        """Return the table for cells of numbers (k, n), with enough terms for an error of a tenth of `tolerance`.
 
-        Raises UnsupportedError where the area is infinite: D grows like 1/cos θ at grazing or faster.
+        Raises UnsupportedError where the area is infinite because D grows like 1/cos θ or faster at grazing angles.
         """
         distinct, which = unique_rows(rows)
         keys = [distinct[:, k].tobytes() for k in range(distinct.shape[1])]
@@ -190,10 +192,10 @@ class Areas:
 
 
 def lobe_norm(device: Device, entry: Model, parameters: Mapping[str, float]) -> float:
-    """Return ∫ K dω of the prefilter's lobe K = D(h)(n·l) with n = v = r, to rounding.
+    """Return ∫ K dω of the prefilter's lobe K = D(h)(n·l) with n = v = r, exact to rounding.
 
-    For a model of the catalogue it is summed from the entry's reference, by Gauss panels in the logarithm of s = 1 -
-    l·r; for a user's NDF on the device (`catalogue.registry.LOBE`).
+    For a catalogue model it is summed from the entry's reference, by Gauss panels in the logarithm of s = 1 - l·r. For
+    a user's NDF it is computed on the device (`catalogue.registry.LOBE`).
     """
     if entry.reference:
         edges = np.concatenate([[0.0], np.geomspace(1e-14, 1.0, 57)])

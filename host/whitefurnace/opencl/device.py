@@ -1,4 +1,7 @@
-"""Finds the OpenCL devices that really work, chooses one, builds kernels and runs them: the only door to pyopencl."""
+"""Finds the OpenCL devices that give right results, chooses one, builds kernels and runs them.
+
+This is the only module that imports pyopencl.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +34,9 @@ INSTALL = (
 
 
 class Tuning(NamedTuple):
-    """The sizes of launches that a kind of device runs fastest with: measured on AVX-512 CPUs, safe elsewhere."""
+    """Launch sizes with which a kind of device runs fastest. They are measured on AVX-512 CPUs, and safe on other
+    devices.
+    """
 
     vectors: int  # T: vectors of W lanes a work item
     local_size: int  # work items a group
@@ -66,10 +71,13 @@ QUEUE_DEPTH = 8
 
 @dataclass(frozen=True)
 class Candidate:
-    """An OpenCL device of the list, and whether it works.
+    """An OpenCL device in the list of devices, and whether it works.
 
-    index: its place, counted from the most preferred device. name, platform, driver: the driver's words. type: "gpu",
-    "cpu" or "other". verdict: "works", or one line that says why not. fp64: whether float64 works too.
+    index                   its place, counted from 0 for the most preferred device
+    name, platform, driver  names as the driver reports them
+    type                    "gpu", "cpu" or "other"
+    verdict                 "works", or one line with the reason why not
+    fp64                    True if float64 works too
     """
 
     index: int
@@ -82,7 +90,7 @@ class Candidate:
 
     @property
     def works(self) -> bool:
-        """Whether a small kernel was built on it and gave the right answer."""
+        """True if a small kernel was built on the device and gave the right result."""
         return self.verdict == "works"
 
 
@@ -332,11 +340,11 @@ def find_devices() -> list[Candidate]:
 
 
 def choose_device(name: str | None = None) -> Device:
-    """Return the first device, best first, that gives right answers; the same object for the whole process.
+    """Return the first device, best first, that gives right results; the same object for the whole process.
 
-    name: an index of `find_devices`, or a part of "platform: device" in any case, where platforms that have it come
-    before devices that do; by default the variable WHITEFURNACE_DEVICE. Only as many devices are tried as it takes.
-    Raises UsageError where no device has that name, and DeviceError where none works.
+    name: an index of `find_devices` or a part of "platform: device" in any case; by default the variable
+    WHITEFURNACE_DEVICE. Devices are tried only until one works. Raises UsageError where no device has that name, and
+    DeviceError where none works.
     """
     if name is None:
         name = os.environ.get("WHITEFURNACE_DEVICE") or None
@@ -371,10 +379,10 @@ def choose_device(name: str | None = None) -> Device:
 
 
 def device_address(name: str | None = None) -> str:
-    """Return the name by which another process of this machine finds the device that `choose_device(name)` gives.
+    """Return a name by which another process of this machine finds the device that `choose_device(name)` returns.
 
-    An index or the preference among several devices may come out differently there; this name does not.
-    Raises what `choose_device` raises.
+    An index, or the preference among several devices, may differ there; this name does not. Raises the errors of
+    `choose_device`.
     """
     return choose_device(name).address
 
@@ -383,7 +391,7 @@ def device_address(name: str | None = None) -> str:
 
 
 class Buffer:
-    """An array in the device's memory; made by `Device.array` and `Device.empty`."""
+    """An array in the device's memory, made by `Device.array` or `Device.empty`."""
 
     def __init__(
         self, device: Device, memory: Any, shape: tuple[int, ...], dtype: np.dtype[Any], shared: np.ndarray | None
@@ -405,9 +413,9 @@ class Buffer:
         return values
 
     def write(self, values: np.ndarray) -> None:
-        """Wait for all launches and copy `values`, of the buffer's shape and dtype, into it.
+        """Wait for all launches and copy `values`, which have the buffer's shape and dtype, into it.
 
-        Raises ValueError for another shape or dtype and DeviceError if a launch failed.
+        Raises ValueError for another shape or dtype, and DeviceError if a launch failed.
         """
         if values.shape != self.shape or values.dtype != self.dtype:
             raise ValueError(f"a buffer of {self.dtype} {self.shape} cannot take {values.dtype} {values.shape}")
@@ -422,7 +430,7 @@ class Buffer:
 
 
 class Kernel:
-    """A kernel of a program; `kernel(global_size, *args)` is `device.launch(kernel, global_size, args)`."""
+    """A kernel of a program. `kernel(global_size, *args)` is `device.launch(kernel, global_size, args)`."""
 
     def __init__(self, device: Device, raw: Any, name: str) -> None:
         self.device = device
@@ -440,7 +448,7 @@ class Kernel:
 
 
 class Program:
-    """A built program; made by `Device.build`."""
+    """A built program, made by `Device.build`."""
 
     def __init__(self, device: Device, raw: Any) -> None:
         self.device = device
@@ -536,7 +544,7 @@ class Device:
 
     @property
     def fp64(self) -> bool:
-        """Whether float64 kernels give right answers; tried at the first use."""
+        """True if float64 kernels give right results; tried at the first use."""
         if self._fp64 is None:
             self._fp64 = False
             if "cl_khr_fp64" in self._raw.extensions.split() or self._raw.double_fp_config:
@@ -546,9 +554,9 @@ class Device:
         return self._fp64
 
     def lanes(self, precision: int = 32) -> int:
-        """Return W, the lanes of a vector: on a CPU 16, 8 or 4 for `precision` 32 and half of that for 64; 1 on a GPU.
+        """Return W, the number of lanes of a vector: 1 on a GPU; on a CPU 16, 8 or 4, and half as many for 64 bits.
 
-        Raises UnsupportedError where the device has no float64 that is right.
+        precision: 32 or 64 bits. Raises UnsupportedError where the device has no correct float64.
         """
         if precision == 32:
             return self._lanes
@@ -560,11 +568,11 @@ class Device:
 
     @property
     def address(self) -> str:
-        """The name by which `choose_device` finds this very device in another process of this machine."""
+        """Name by which `choose_device` finds this very device in another process of this machine."""
         return _address(self._raw)
 
     def identity(self) -> dict[str, str]:
-        """Return what a manifest records of the device: name, platform, driver, version, type."""
+        """Return the facts of the device that a manifest records: name, platform, driver, version and type."""
         return {
             "name": self.name,
             "platform": self.platform,
@@ -574,9 +582,9 @@ class Device:
         }
 
     def build(self, text: str, options: Mapping[str, int | float | str] | None = None) -> Program:
-        """Build OpenCL C 1.2 `text` and return the program, the same one for the same text and options.
+        """Build OpenCL C 1.2 `text` and return the program; the same text and options return the same object.
 
-        options: names and values, each passed as -D. Floats are written as Python does, without a suffix. Raises
+        options: values by name, each passed as -D. Floats are written as Python writes them, without a suffix. Raises
         DeviceError with the compiler's first errors.
         """
         cl = _opencl()  # refused in a forked process before the lock, which a thread of the parent may have held
@@ -619,22 +627,24 @@ class Device:
         return Buffer(self, memory, shape, dtype, values if share else None)
 
     def array(self, values: np.ndarray, *, writable: bool = False) -> Buffer:
-        """Return a buffer that holds `values`, for kernels to read, and to write too where `writable`.
+        """Return a buffer that holds `values`. Kernels may read it, and with `writable` write it too.
 
-        On a CPU a contiguous array at an aligned address (`aligned_empty` gives one) is not copied unless `writable`:
-        do not change it while the buffer lives. Raises DeviceError where there is no room.
+        On a CPU a contiguous array at an aligned address (see `aligned_empty`) is not copied unless `writable`: do not
+        change it while the buffer exists. Raises DeviceError where there is not enough memory.
         """
         values = np.ascontiguousarray(values).reshape(np.shape(values))
         share = self.type == "cpu" and not writable and values.nbytes > 0 and values.ctypes.data % self._alignment == 0
         return self._allocate(values.shape, values.dtype, values, writable=writable, share=share)
 
     def empty(self, shape: int | tuple[int, ...], dtype: Any) -> Buffer:
-        """Return a buffer of undefined content, for kernels to write. Raises DeviceError without room for it."""
+        """Return a buffer with undefined values, for kernels to write. Raises DeviceError where there is not enough
+        memory.
+        """
         shape = (int(shape),) if isinstance(shape, (int, np.integer)) else tuple(int(n) for n in shape)
         return self._allocate(shape, np.dtype(dtype), None, writable=True, share=False)
 
     def aligned_empty(self, shape: int | tuple[int, ...], dtype: Any) -> np.ndarray:
-        """Return a host array of undefined content, so aligned that `array` need not copy it on a CPU."""
+        """Return a host array with undefined values, aligned so that `array` need not copy it on a CPU."""
         dtype = np.dtype(dtype)
         nbytes = int(np.prod(shape, dtype=np.int64)) * dtype.itemsize
         raw = np.empty(nbytes + self._alignment, np.uint8)
@@ -648,11 +658,11 @@ class Device:
         args: Sequence[Buffer | np.generic | None],
         local_size: tuple[int, ...] | None = None,
     ) -> None:
-        """Enqueue `kernel` over `global_size` work items; nothing is padded.
+        """Enqueue `kernel` over exactly `global_size` work items.
 
         args: buffers of this device, numpy scalars of the kernel's types, or None for a null pointer. local_size: by
         default `(self.local_size, 1, …)`; the global size must be a multiple of it. Raises DeviceError where the
-        runtime refuses; a failure while running is raised by a later call.
+        runtime refuses; a failure while the kernel runs is raised by a later call.
         """
         first, *rest = local_size or (self.local_size, *(1,) * (len(global_size) - 1))
         while first > max(kernel.work_group_limit, 1):  # halves still divide a padded global size

@@ -1,4 +1,4 @@
-"""Launches of kernels over cells: rows of numbers, one cell a lane, in blocks of bounded size."""
+"""Launches kernels over cells: columns of numbers, one cell in each lane, in blocks of bounded size."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ def over_cells(
 ) -> np.ndarray:
     """Run a kernel over cells and return its values, (components, n), in the working precision.
 
-    cells: (rows, n) float64, one column a cell. components: numbers that the kernel writes for each cell. precision: 32
-    or 64. between: the arguments of the kernel from the number of cells to the cells; arrays among them are sent in the
-    working precision. Lanes past the end repeat the last cell.
+    cells: (rows, n) float64, one column for each cell. components: numbers that the kernel writes for each cell.
+    precision: 32 or 64 bits. between: arguments of the kernel between the number of cells and the cells; arrays among
+    them are sent in the working precision. Lanes past the end repeat the last cell.
     """
     kind = np.dtype(f"f{precision // 8}")
     lanes = device.lanes(precision)
@@ -56,9 +56,9 @@ def over_nodes(
     rule: Rule,
     azimuths: bool = True,
 ) -> np.ndarray:
-    """Run a kernel that sums over the nodes of a quadrature rule: `over_cells` with the rule's tables between.
+    """Run a kernel that sums over the nodes of a quadrature rule: `over_cells` with the rule's tables as `between`.
 
-    azimuths: whether the kernel takes the nodes of the azimuth too.
+    azimuths: True if the kernel takes the azimuth nodes too.
     """
     polar, azimuthal = rule.tables()
     between: list[np.generic | np.ndarray] = [*map(np.int32, rule.counts), polar]
@@ -70,11 +70,11 @@ def over_nodes(
 def evaluate(
     device: Device, function: str, slots: Mapping[str, Model], cells: np.ndarray, precision: int, area_terms: int = 0
 ) -> np.ndarray:
-    """Evaluate a function of a model at its own arguments on the device: (components, n).
+    """Evaluate a function of a model on the device at given arguments: (components, n).
 
-    function: its name as kernels call it (`NDF_D`, `FRESNEL_F`, …). slots: the models of the program. cells: (rows, n),
-    the function's arguments first (three rows for a vector), then the parameters and constants of each slot, then the
-    table of Smith's area of `area_terms` terms where the masking reads one. precision: 32 or 64.
+    function: its name in kernels (`NDF_D`, `FRESNEL_F`, …). slots: the models of the program. cells: (rows, n), the
+    function's arguments first (three rows for a vector), then the parameters and constants of each slot, then the table
+    of Smith's area of `area_terms` terms where the masking reads one. precision: 32 or 64 bits.
     """
     components = 3 if function == "BRDF_F" else 1
     return over_cells(

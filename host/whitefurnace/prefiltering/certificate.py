@@ -8,7 +8,7 @@ import numpy as np
 
 
 def texel_errors(values: np.ndarray, reference: np.ndarray, mean: float) -> np.ndarray:
-    """Texel errors (m,): the maximum over channels of |x - ref| / max(ref, 1e-3 · mean), with 0/0 = 0.
+    """Return texel errors (m,): the maximum over channels of |x - ref| / max(ref, 1e-3 · mean), with 0/0 = 0.
 
     values, reference: (m, 3) radiance. mean: mean radiance of the level.
     """
@@ -25,14 +25,15 @@ def statement(
     mean: float,
     total: int,
 ) -> tuple[float, float, float]:
-    """The stated (error, worst, rmse) of a level, from a sample of its texels.
+    """Return the stated (error, worst, rmse) of a level, from a sample of its texels.
 
     `error` bounds the 99th percentile of the texel errors at 95 % confidence, by the uniform draw. `worst` is the
-    largest of all. In `rmse` the near-source texels count as they are, and the uniform texels outside them are weighted
-    by inverse probability for the rest of the level. All three are infinite where a texel error is not finite.
+    largest of all. In `rmse` the near-source texels have their own weight, and the uniform texels outside them are
+    weighted by inverse probability for the rest of the level. All three are infinite where a texel error is not finite.
 
-    sample: texel indices, a uniform draw and the near-source sample. values, reference: (m, 3) radiance of the texels
-    of both, in this order; solid_angle: (m,) theirs. mean: mean radiance of the level. total: its number of texels.
+    sample: texel indices, those of a uniform draw and those of the near-source sample. values, reference: (m, 3)
+    radiance of both, in this order. solid_angle: (m,) solid angles of these texels. mean: mean radiance of the level.
+    total: number of texels of the level.
     """
     reference = reference.astype(np.float64)
     errors = texel_errors(values, reference, mean)
@@ -53,10 +54,10 @@ QUANTILE, CONFIDENCE = 0.99, 0.95
 
 
 def rank(n: int) -> int:
-    """Index, from the largest down, of the error among those of n uniform texels that bounds the 99th percentile.
+    """Return the rank, from the largest error down, of the one that bounds the 99th percentile of n uniform texels.
 
-    The bound holds at 95 % confidence: the probability that so few errors or fewer lie above the percentile is at most
-    5 % (order statistic). The index is 0, the largest error, for n = 299, the fewest texels that give a bound.
+    The bound holds at 95 % confidence: the probability that this many errors or fewer lie above the percentile is at
+    most 5 % (order statistic). The rank is 0, the largest error, for n = 299, the smallest n that gives a bound.
     """
     # The sum uses logarithms, since .99^n underflows float64 beyond n = 74 000.
     found, chance, below = -1, n * math.log(QUANTILE), 0.0

@@ -49,9 +49,11 @@ class Level:
     texels     (6, size, size, 3) or lat-long (size, 2 size, 3) float32 linear radiance
     roughness  perceptual roughness
     error      bound on the 99th percentile of the texel errors, at 95 % confidence
-    worst      largest texel error that was seen; `rmse`: relative RMSE
-    method     how the level was made; `grid`: nodes a face edge of its source grid
-    pairs      lobe evaluations
+    worst      largest texel error that was seen
+    rmse       relative RMSE
+    method     how the level was made
+    grid       nodes of a face edge of its source grid
+    pairs      number of lobe evaluations
     seconds    wall time, with the certificate
     """
 
@@ -69,9 +71,9 @@ class Level:
 class Convolver:
     """Prefilters one environment on one device.
 
-    precision: 32 or 64 bits; 32 where the device has no float64. seed: of the certificates' samples. progress: called
-    while work is done. `texels` is the environment as kernels read it; all values are scaled by `scale`, a power of
-    two.
+    precision: 32 or 64 bits; 32 where the device has no float64. seed: seed of the certificates' samples. progress:
+    called while work is done. `texels` is the environment as kernels read it; all values are multiplied by `scale`, a
+    power of two.
     """
 
     def __init__(
@@ -102,8 +104,10 @@ class Convolver:
         self._harmonics: dict[int, np.ndarray] = {}  # 9 × 3 coefficients and ∑w, by cuts
 
     def prepare(self, n: int, cuts: int) -> None:
-        """Announces the finest grid (n nodes an edge) that a set of levels needs and the texel cuts for it, so that no
-        grid is made from the texels twice."""
+        """Announce the finest grid that a set of levels needs, so that no grid is made from the texels twice.
+
+        n: nodes of its edge. cuts: nodes of each texel's edge for it.
+        """
         self.texels.prepare(n, cuts)
 
     # ------------------------------------------------------------------------------------------- levels
@@ -120,10 +124,10 @@ class Convolver:
     def convolve(
         self, lobe: Lobe, shape: Shape, n: int, tolerance: float, share: tuple[float, ...] = (0.0, 1.0)
     ) -> np.ndarray:
-        """The level over all texels of `shape`, (dims, 3) float32, from the n × n grid and the bright texels.
+        """Compute a level from the n × n grid and the bright texels: all texels of `shape`, (dims, 3) float32.
 
-        tolerance: of the level's error. share: progress before and after. Raises ValueError for an n that is not a
-        multiple of 16.
+        tolerance: tolerance of the level's error. share: progress before and after. Raises ValueError for an n that is
+        not a multiple of 16.
         """
         if n % 16:
             raise ValueError(f"a grid of {n} nodes an edge is not a multiple of the tiles' 16")
@@ -188,7 +192,9 @@ class Convolver:
             self.progress(lobe.name, share[0] + (share[1] - share[0]) * min(done * 8 * exchanges / shape.count, 1.0))
 
     def interpolate(self, level: Buffer, shape: Shape, grid: Buffer) -> None:
-        """Writes into `level` the texels of `shape`, read from values at the nodes of `grid`, with the base added."""
+        """Write the texels of `shape` into `level`, interpolated from values at the nodes of `grid`, with the base
+        added.
+        """
         kernel = self.device.build(source.interpolation().text, {"W": 1, "T": 1, "PRECISION": self.precision}).kernel(
             "interpolate"
         )
@@ -214,12 +220,11 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- exact integrals
 
     def exact(self, wanted: Sequence[tuple[Lobe, np.ndarray]], cuts: int, tolerance: float = 1e-3) -> list[np.ndarray]:
-        """Exact values of lobes in given directions: the integral over every source texel, (m, 3) float64 each, in one
-        pass.
+        """Compute exact values of lobes in given directions: (m, 3) float64 for each pair of `wanted`.
 
-        wanted: (lobe, directions (3, m)) pairs. cuts: nodes an edge of each texel; bright texels are cut twice as
-        finely as in `convolve`. tolerance: that of the level. The spherical harmonics of the same nodes are kept where
-        `harmonics` needs them.
+        wanted: (lobe, directions (3, m)) pairs. Every source texel is summed, in one pass for all pairs. cuts: nodes of
+        each texel's edge; bright texels are cut twice as finely as in `convolve`. tolerance: tolerance of the level.
+        The spherical harmonics of the same nodes are kept if `harmonics` needs them.
         """
         if any(directions.shape[1] > MOST_TOGETHER for _, directions in wanted):  # of a certificate of many texels
             pieces = [
@@ -251,7 +256,7 @@ class Convolver:
         ]
 
     def exact_narrow(self, lobe: Lobe, directions: np.ndarray, cuts: int, tolerance: float) -> np.ndarray:
-        """As `exact`, for one lobe that is much narrower than a texel.
+        """Compute what `exact` does, for one lobe that is much narrower than a texel: (m, 3) float64.
 
         Texels are cut finely only near the lobe's direction; beyond a window, larger parts resolve the lobe.
         """
@@ -286,7 +291,7 @@ class Convolver:
         return self._value(lobe, block, sums, tolerance, directions.shape[1])
 
     def on_grid(self, lobe: Lobe, directions: np.ndarray, n: int, tolerance: float) -> np.ndarray:
-        """As `exact` for one lobe, over the n × n grid in place of every texel."""
+        """Compute what `exact` does for one lobe, from the n × n grid instead of every texel: (m, 3) float64."""
         if directions.shape[1] > MOST_TOGETHER:
             pieces = np.array_split(directions, -(-directions.shape[1] // MOST_TOGETHER), 1)
             return np.concatenate([self.on_grid(lobe, piece, n, tolerance) for piece in pieces])
@@ -367,10 +372,10 @@ class Convolver:
         return 2 * math.ceil(self.texel / 0.05)  # pairs of Gauss points on .05 rad: 2e-8 for these polynomials
 
     def harmonics(self) -> tuple[np.ndarray, float]:
-        """Radiance coefficients (9, 3) float64 from nodes of every texel, and their error over the largest L00.
+        """Return radiance coefficients (9, 3) float64 from nodes of every texel, and their error over the largest L00.
 
-        The error is the difference to another quadrature of the same texels, with twice as many nodes an edge on a
-        small image, else the finest grid, plus float32's rounding.
+        The error is the difference to another quadrature of the same texels plus float32's rounding. That quadrature
+        has twice as many nodes of an edge on a small image, otherwise it is the finest grid.
         """
         cuts = self._harmonic_cuts
         if cuts not in self._harmonics:
@@ -391,14 +396,20 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- level 0
 
     def exact_means(self, shape: Shape, index: np.ndarray) -> np.ndarray:
-        """The mean of the source over chosen texels of `shape`, (m, 3) float64, by another method than `means`."""
+        """Return the mean of the source over chosen texels of `shape`, (m, 3) float64, by another method than `means`.
+
+        index: flat indices of the texels, (m,).
+        """
         if shape.octahedral:
             return octahedral_means(self.environment, shape, index, POINTS[1]) * self.scale
         return self.overlaps.exact(shape, index)
 
     def means(self, shape: Shape) -> np.ndarray:
-        """The mean source radiance over each texel of `shape`, (dims, 3) float32: by exact overlaps, or for octahedral
-        maps by points, whose error the certificate finds."""
+        """Return the mean source radiance over each texel of `shape`, (dims, 3) float32.
+
+        The means are computed by exact overlaps, or for octahedral maps from points, whose error the certificate
+        measures.
+        """
         if shape.octahedral:
             index = np.arange(shape.count)
             means = octahedral_means(self.environment, shape, index, POINTS[0]) * self.scale
@@ -408,7 +419,7 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- statement
 
     def sample(self, shape: Shape, uniform_count: int = CERTIFIED) -> tuple[np.ndarray, np.ndarray]:
-        """Indices of the texels of a certificate: (uniform draw, near-source sample).
+        """Draw the texels of a certificate: flat indices of a uniform draw, and of the near-source sample.
 
         The near-source sample holds the texels nearest the brightest sources. It is empty where the level is so small
         that all of its texels are drawn.

@@ -43,16 +43,17 @@ GOLDEN = (math.sqrt(5) - 1) / 2
 
 
 class Sampler:
-    """Filtered importance sampling [Krivanek2008; Colbert2007, GPU Gems 3, ch. 20] of one environment.
+    """Computes levels of one environment by filtered importance sampling.
 
-    The environment is a cube of exact means over its texels, with a pyramid of means above it. Sums are over the
-    radiance above the smallest value of each channel, so that a constant environment comes out exactly.
+    [Krivanek2008; Colbert2007, GPU Gems 3, ch. 20] The environment is a cube of exact means over its texels, with a
+    pyramid of means above it. Sums are over the radiance above the smallest value of each channel, so that a constant
+    environment gives exactly that constant.
 
     Every texel uses the same samples, in frames that turn slowly from texel to texel. A random turn of each texel
     leaves the RMSE as it is (32 to 1 024 samples, four environments) and turns errors that neighbours share into noise.
 
-    precision: of the kernels, in bits; float32 leaves 4e-6. progress: called with a lobe's name and a share of the
-    whole.
+    precision: 32 or 64 bits of the kernels; float32 has an error of 4e-6. progress: called with a lobe's name and the
+    share of all work that is done.
     """
 
     def __init__(self, means: Means, precision: int = 32, progress: Callable[[str, float], None] | None = None) -> None:
@@ -76,7 +77,9 @@ class Sampler:
         self.device.launch(self._kernel(name, 1), (-(-count // size) * size,), args)
 
     def pyramid(self, size: int) -> Buffer:
-        """All levels of the pyramid that begins at `size` texels a face edge, in the layout of `pyramid.cl`."""
+        """Return all levels of the pyramid that begins at `size` texels of a face edge, in the layout of
+        `pyramid.cl`.
+        """
         if size not in self._pyramids:
             texels = self.device.array(self.means.level(Shape(False, size)))
             levels = size.bit_length()
@@ -92,7 +95,7 @@ class Sampler:
         return self._pyramids[size]
 
     def level(self, lobe: Lobe, shape: Shape, count: int, share: tuple[float, ...] = (0.0, 1.0)) -> np.ndarray:
-        """The level over all texels of `shape` by `count` samples each, (dims, 3) float32, in the units of the means.
+        """Compute a level by `count` samples in each texel of `shape`: (dims, 3) float32, in the units of the means.
 
         share: progress before and after.
         """
@@ -147,18 +150,18 @@ class Sampler:
 
 
 def light_samples(lobe: Lobe, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(directions (count, 3), shares (count,), solid angles (count,)) of a lobe's samples, float64.
+    """Return the samples of a lobe: directions (count, 3), shares (count,) and solid angles (count,), float64.
 
-    Directions l are in the frame of n = v. The shares weigh the samples and sum to 1. A sample stands for the solid
-    angle 1/(count · pdf).
+    Directions l are in the frame of n = v. The shares are the weights of the samples and sum to 1. A sample stands for
+    the solid angle 1/(count · pdf).
 
     Half vectors have the density D(h)(n·h) of the NDF, within 45° of n, since others reflect below the horizon. With
     θ_l = 2θ_h, dω_l = 4 (n·h) dω_h, so pdf(l) = D/(4 ∫ D (n·h) dω_h), and the weight that remains of K = D(h)(n·l) is
-    n·l [Karis2013, "Real Shading in Unreal Engine 4"]. Where a mixture of lobes is negative, |D| is sampled and its
-    sign goes into the share. Directions of irradiance have the density n·l/π and equal shares.
+    n·l [Karis2013, "Real Shading in Unreal Engine 4"]. Where a mixture of lobes is negative, |D| is sampled and the
+    share gets its sign. Directions of irradiance have the density n·l/π and equal shares.
 
     The samples are a two-dimensional lattice: equal steps of energy, and azimuths by the golden ratio, whose points
-    keep their distance at every count [Vogel1979]. It leaves two thirds of the error of Hammersley's points (four
+    keep their distance at every count [Vogel1979]. Its error is two thirds of that of Hammersley's points (four
     environments).
     """
     u = (np.arange(count) + 0.5) / count

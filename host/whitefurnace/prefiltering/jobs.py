@@ -28,7 +28,7 @@ class Job:
 
     @property
     def own_lobe(self) -> Lobe:
-        """The lobe of a level that has one."""
+        """The lobe of a level. Only valid for a level that has a lobe."""
         assert self.lobe is not None
         return self.lobe
 
@@ -39,9 +39,9 @@ class Job:
 
 
 def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False, octahedral: bool = False) -> list[Job]:
-    """The jobs of a specular chain, one a level.
+    """Return the jobs of a specular chain, one for each level.
 
-    The levels are cubes, or with `latlong` images of twice a face's height, or with `octahedral` octahedral maps.
+    latlong: make lat-long images with as many rows as two faces, instead of cubes. octahedral: make octahedral maps.
     """
     jobs = []
     planned = planning.plan_chain(recipe, convolver.texel, convolver.share, convolver.texels.centred)
@@ -69,9 +69,9 @@ def chain_jobs(convolver: Convolver, recipe: Chain, *, latlong: bool = False, oc
 
 
 def irradiance_job(convolver: Convolver, size: int, tolerance: float, samples: int | None = None) -> Job:
-    """The job of an irradiance cube with faces of size² texels.
+    """Return the job of an irradiance cube with faces of size² texels.
 
-    tolerance: bound on its `error`. samples: a texel, by importance sampling; None for convolution on a grid.
+    tolerance: bound on its `error`. samples: importance samples for each texel; None for convolution on a grid.
     """
     cuts = planning.cuts_for(convolver.texel, 1.0, tolerance, convolver.share, convolver.texels.centred)
     grid = 0 if samples else planning.grid_size(1.0, tolerance)

@@ -60,10 +60,10 @@ Mixture = tuple[tuple[float, float], ...]
 
 
 def read_mixtures(device: Device, recipe: Chain) -> tuple[Mixture | None, ...]:
-    """The best mixture of lobes for each level of a chain, so that interpolated roughness values are most accurate.
+    """Return the mixture of lobes for each level of a chain with which interpolated roughness values are most accurate.
 
-    None for the first level, which stays the exact mean. The NDF's lobes come from the reference of its entry, a user's
-    from the device.
+    It is None for the first level, which stays the exact mean. The NDF's lobes come from the reference of its entry,
+    those of a user's NDF from the device.
     """
     mapping = (recipe.lods, recipe.size) if recipe.lods.lod else ()
     key = repr((sorted(recipe.ndf.canonical().items()), mapping))
@@ -105,7 +105,9 @@ def _cached(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
 
 
 def angles() -> tuple[np.ndarray, np.ndarray]:
-    """Nodes θ and weights of Gauss panels on [0, π/2] that double in width, for lobes of α from 1e-4 to 1."""
+    """Return nodes θ in radians and weights of Gauss panels on [0, π/2] that double in width, for lobes of α from
+    1e-4 to 1.
+    """
     x, w = gauss(4)
     edges = np.concatenate([[0.0], np.geomspace(2e-5, math.pi / 2, 44)])
     width = np.diff(edges)[:, None]
@@ -128,9 +130,9 @@ def _within(radius: float, seen: np.ndarray, theta: np.ndarray) -> np.ndarray:
 
 
 def fitted(lobes: _Lobes, levels: int) -> tuple[Mixture | None, ...]:
-    """The mixtures of a chain's levels, None for the first.
+    """Return the mixtures of a chain's levels, None for the first.
 
-    The fit minimises the sum over scenes of the mean over r of the RMS over directions of |read/exact - 1|, where each
+    The fit minimizes the sum over scenes of the mean over r of the RMS over directions of |read/exact - 1|, where each
     scene is relative to the error of the levels' own lobes. It is an iteratively reweighted least-squares fit (the
     square root of a sum of squares weighs it by 1/RMS), under ∑_j c_kj = 1 and mixture ≥ LEAST × own lobe at every θ.
     """

@@ -52,15 +52,15 @@ class _Task:
 def run_jobs(
     convolver: Convolver, jobs: Sequence[Job], tolerance: float, *, certify: int = CERTIFIED, clock: Clock | None = None
 ) -> list[Level]:
-    """Make, certify and where needed refine every level, in the order of `jobs`.
+    """Make every level, certify it, and refine it where needed; return the levels in the order of `jobs`.
 
-    The exact values come first, because the cuts that they need are the cuts that the grids need.
+    The exact values are computed first, because they determine the cuts that the grids need.
 
-    tolerance: bound on `error` of every level. certify: uniform texels of each certificate; 0 for none, then `error`,
-    `worst` and `rmse` are NaN and nothing is refined. clock: is given the time spent.
+    tolerance: bound on `error` of every level. certify: number of uniform texels of each certificate; 0 for none, then
+    `error`, `worst` and `rmse` are NaN and nothing is refined. clock: gets the time spent.
 
     Raises CheckError when a level misses the tolerance and finer grids do not help. A level by importance sampling
-    keeps the number of samples that was asked for, and states the error that they leave.
+    keeps the number of samples that was asked for, and states its error.
     """
     clock = clock or Clock()
     begin = time.perf_counter()

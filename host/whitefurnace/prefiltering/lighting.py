@@ -1,5 +1,4 @@
-"""Prefilters the light of an environment: the specular chain, irradiance and spherical harmonics, with certified
-errors."""
+"""Prefilters the light of an environment: the specular chain, irradiance and harmonics, with certified errors."""
 
 from __future__ import annotations
 
@@ -31,7 +30,7 @@ class Prefiltered:
     roughness    (n,) perceptual roughness
     error        (n,) bound on the 99th percentile of the texel errors, at 95 % confidence
     worst, rmse  (n,) largest texel error that was seen, and relative RMSE
-    evaluations  lobe evaluations of the convolution
+    evaluations  number of lobe evaluations of the convolution
     seconds      wall time; `timings` splits it into "source" (bright texels, grids), "levels" and "certificate"
     rule         the method of each level
     """
@@ -133,10 +132,10 @@ def light(
 ) -> Lighting:
     """Prefilter an environment for several chains, which share grids, certificates and equal levels.
 
-    wants: the chains; the tolerance of the first holds for irradiance too. seed: of the certificates' samples.
+    wants: the chains; the tolerance of the first is also that of irradiance. seed: seed of the certificates' samples.
     progress: called with the current activity and the share of the work done.
 
-    Raises CheckError where a level cannot reach its tolerance, DeviceError where the device fails.
+    Raises CheckError where a level cannot reach its tolerance, and DeviceError where the device fails.
     """
     begin = time.perf_counter()
     recipe = wants[0].recipe
@@ -231,16 +230,16 @@ def prefilter(
 ) -> Prefiltered:
     """Prefilter the specular chain of an environment.
 
-    source: a path, an array or an `Environment`. size, min_size: texels a face edge of the first and the last level,
+    source: a path, an array or an `Environment`. size, min_size: texels of a face edge of the first and the last level,
     powers of two. ndf: name or entry of an isotropic NDF. tolerance: bound on `error` of every level, 1e-3 by default.
-    quality: "draft", "normal" or "reference", in place of a tolerance. samples: filtered importance samples a texel, 1
-    to 65536, in place of both; `error` is then what they leave. levels: number of levels. fit: "read" fits the levels
-    so that interpolated roughness values are most accurate. certify: uniform texels of each level's certificate, 299
-    or more; 0 for none, then `error`, `worst` and `rmse` are NaN and nothing is refined. rotate: degrees about +Y.
-    exposure: stops. nonfinite: "refuse" or "zero" for NaN and infinite texels. latlong: make lat-long images of 2·size
-    rows.
+    quality: "draft", "normal" or "reference", instead of a tolerance. samples: number of filtered importance samples
+    for each texel, 1 to 65536, instead of both; `error` is then the error that they leave. levels: number of levels.
+    fit: "read" fits the levels so that interpolated roughness values are most accurate. certify: number of uniform
+    texels of each level's certificate, 299 or more; 0 for none, then `error`, `worst` and `rmse` are NaN and nothing is
+    refined. rotate: degrees about +Y. exposure: stops. nonfinite: "refuse" or "zero" for NaN and infinite texels.
+    latlong: make lat-long images of 2·size rows.
 
-    Raises the errors of `environment`, UsageError, UnsupportedError, CheckError, DeviceError.
+    Raises the errors of `environment`, UsageError, UnsupportedError, CheckError and DeviceError.
     """
     begin = time.perf_counter()
     recipe = chain(
@@ -275,9 +274,9 @@ def irradiance(
     nonfinite: str = "refuse",
     device: Device | str | None = None,
 ) -> Certified:
-    """The irradiance of an environment over π, as a cube (6, size, size, 3) float32.
+    """Compute the irradiance of an environment divided by π, as a cube (6, size, size, 3) float32.
 
-    A constant environment of 1 gives 1. size: texels a face edge, 1 to 1024. The other parameters and the errors
+    A constant environment of 1 gives 1. size: texels of a face edge, 1 to 1024. The other parameters and the errors
     raised are those of `prefilter`.
     """
     if not 1 <= size <= 1024:
@@ -307,7 +306,7 @@ def harmonics(
     nonfinite: str = "refuse",
     device: Device | str | None = None,
 ) -> Certified:
-    """Spherical harmonics of an environment's radiance to degree 2, (9, 3) float64.
+    """Compute the spherical harmonics of an environment's radiance to degree 2, (9, 3) float64.
 
     The basis is real and orthonormal in world x, y, z, without the Condon-Shortley sign, in the order L00, L1-1, L10,
     L11, L2-2, L2-1, L20, L21, L22. The parameters and the errors raised are those of `prefilter`.

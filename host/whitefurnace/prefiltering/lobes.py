@@ -43,13 +43,13 @@ class Series:
 
 @dataclass(frozen=True)
 class Lobe:
-    """A lobe K to convolve with: the cosine of irradiance, or the weighted sum of one or several NDFs' lobes.
+    """A lobe K to convolve with: the cosine of irradiance, or the weighted sum of lobes of one NDF.
 
-    summands  (NDF, its numbers for the kernels, the weight that scales D) of each; empty for irradiance
+    summands  (NDF, its numbers for the kernels, the weight of its D) of each lobe; empty for irradiance
     norm      ∫K dω
-    alpha     width of the lobe, as the α of a GGX lobe that is as sharp
-    horizon   strength of its kink where l sets, as the α of a GGX lobe with the same
-    density   D at q = |l - r|², float64: K = D (1 - q/2)₊
+    alpha     width of the lobe: the α of a GGX lobe that is as sharp
+    horizon   strength of its kink at the horizon: the α of a GGX lobe with the same kink
+    density   D at q = |l - r|², float64, where K = D (1 - q/2)₊
     """
 
     name: str
@@ -62,7 +62,7 @@ class Lobe:
 
     @cached_property
     def reach(self) -> float:
-        """The q beyond which a billionth of the lobe's integral lies, at most 2."""
+        """The value of q beyond which a billionth of the lobe's integral lies, at most 2."""
         edges = np.concatenate([[0.0], np.geomspace(1e-12, 2.0, 2001)])
         q = (edges[1:] + edges[:-1]) / 2
         energy = np.abs(self.density(q)) * np.maximum(1 - q / 2, 0) * np.diff(edges) * math.pi / self.norm
@@ -70,9 +70,9 @@ class Lobe:
         return float(edges[1:][np.flatnonzero(beyond > 1e-9)[-1]]) if (beyond > 1e-9).any() else 2.0
 
     def series(self, low: float, high: float, error: float) -> Series:
-        """The shortest series found for K on q in [low, high] whose error is at most `error` of the lobe's integral.
+        """Return the shortest series for K on q in [low, high] whose error is at most `error` of the lobe's integral.
 
-        Where no series reaches that, the most accurate one of MOST_TERMS terms.
+        If no series reaches that, the most accurate one of MOST_TERMS terms is returned.
         """
         whose = tuple((entry.name, entry.text, *rest) for entry, *rest in self.summands)
         key = (whose, error, low, high)
@@ -140,10 +140,10 @@ def _fit(density: Callable[[np.ndarray], np.ndarray], norm: float, low: float, h
 
 
 def ndf_lobe(device: Device, choice: Chosen, roughness: float, parameters: Mapping[str, Any]) -> Lobe:
-    """The prefilter's lobe of an NDF.
+    """Return the prefilter's lobe of an NDF.
 
-    roughness: perceptual. parameters: of the NDF, by name. Raises InputError for a user's NDF that cannot be
-    normalized.
+    roughness: perceptual roughness. parameters: parameters of the NDF, by name. Raises InputError for a user's NDF that
+    cannot be normalized.
     """
     entry = choice.model
     rows = np.array([[parameters[p.name]] for p in entry.parameters], np.float64).reshape(-1, 1)
@@ -167,10 +167,10 @@ def mixture_lobe(
     parts: Sequence[tuple[float, float]],
     parameters: Callable[[float], Mapping[str, Any]],
 ) -> Lobe:
-    """The weighted sum of an NDF's normalized lobes at several roughness values, a lobe of norm 1.
+    """Return the weighted sum of an NDF's normalized lobes at several roughness values, a lobe of norm 1.
 
-    parts: (weight, perceptual roughness) of each; the weights sum to 1. parameters: gives the NDF's parameters at a
-    roughness. Raises InputError for a user's NDF that cannot be normalized.
+    parts: (weight, perceptual roughness) of each lobe; the weights sum to 1. parameters: a function that returns the
+    NDF's parameters at a roughness. Raises InputError for a user's NDF that cannot be normalized.
     """
     lobes = [(weight, ndf_lobe(device, choice, r, parameters(r))) for weight, r in parts if weight != 0]
     summands = tuple(

@@ -1,5 +1,7 @@
-"""Computes the mean of a source over each texel of a cube or a lat-long (level 0) by exact areas of overlap. Data that
-depend on the two grids alone are made once and kept for every image of the same size."""
+"""Computes the mean of a source over each texel of a cube or a lat-long (level 0) by exact areas of overlap.
+
+Data that depend on the two grids alone are made once and kept for every image of the same size.
+"""
 
 from __future__ import annotations
 
@@ -43,15 +45,16 @@ class _Batch:
 
 
 class Means:
-    """The means of one source.
+    """Computes means of one source over texels.
 
-    texels: float32, (h, w, 3) for a lat-long or (6, n, n, 3) for a cube in the GL-direct layout. rotation: radians by
-    which the azimuth atan2(z, x) of the source grows. radiance: the same texels on the device, if they are there
+    texels: float32, (h, w, 3) for a lat-long or (6, n, n, 3) for a cube in the GL-direct layout. rotation: radians that
+    are added to the azimuth atan2(z, x) of the source. radiance: the same texels on the device, if they are there
     already. Neither may change while this object exists.
 
-    Error: areas are right to 1e-11 of a texel's, sums are float64, and the level is rounded to float32 once, by half an
-    ulp. Weights add up to 1, so that a constant comes out exactly. A cube source that is turned, or that is read as a
-    lat-long, is clipped by polygons of great circles: 1e-5 next to a sun of 1e6, 1e-4 at the poles of a small lat-long.
+    Areas are exact to 1e-11 of a texel's area, sums are float64, and the level is rounded to float32 once (half an
+    ulp). Weights add up to 1, so that a constant image gives exactly that constant. A cube source that is rotated, or
+    that is read as a lat-long, is clipped by polygons of great circles: its error is 1e-5 next to a sun of 1e6, and
+    1e-4 at the poles of a small lat-long.
     """
 
     def __init__(self, device: Device, texels: np.ndarray, rotation: float, radiance: Buffer | None = None) -> None:
@@ -70,7 +73,7 @@ class Means:
         return self._radiance
 
     def level(self, shape: Shape) -> np.ndarray:
-        """The mean radiance over each texel of `shape`, (dims, 3) float32. Raises DeviceError."""
+        """Return the mean radiance over each texel of `shape`, (dims, 3) float32. Raises DeviceError."""
         if self._same_texels(shape):
             return self.texels.copy()
         if not self.device.fp64:
@@ -84,7 +87,10 @@ class Means:
         return self._latlong(shape) if shape.latlong else self._cube_from_latlong(shape.size)
 
     def exact(self, shape: Shape, index: np.ndarray) -> np.ndarray:
-        """The mean over chosen texels of `shape`, by flat index, (m, 3) float64, on the host and by another method."""
+        """Return the mean over chosen texels of `shape`, (m, 3) float64, computed on the host.
+
+        The method differs from that of `level`. index: flat indices of the texels, (m,).
+        """
         return mean_over_texels(self.texels, self.rotation, shape.latlong, shape.size, index)
 
     def _same_texels(self, shape: Shape) -> bool:

@@ -1,4 +1,4 @@
-"""Plans the work of a specular chain: source grids, texel cuts, precision and launch sizes that a tolerance needs."""
+"""Plans the work of a specular chain: source grids, texel cuts, precision and launch sizes for a tolerance."""
 
 from __future__ import annotations
 
@@ -31,8 +31,10 @@ SYMMETRIC = 8
 
 
 def splits_for(groups: int, classes: int) -> int:
-    """Number of partial sums into which a launch of `groups` work items divides its classes, so that all cores are
-    busy."""
+    """Return the number of partial sums into which a launch divides its classes so that all cores are busy.
+
+    groups: work items of the launch. classes: number of classes of nodes.
+    """
     return max(1, min(-(-SPREAD // groups), classes // RUN))
 
 
@@ -58,7 +60,9 @@ NEAR_BRIGHT = 64
 
 
 def precision_for(tolerance: float) -> int:
-    """Working precision in bits for a tolerance. Float32 leaves up to 3e-5 on dark texels, so below 1e-4 it is 64."""
+    """Return the working precision for a tolerance: 64 bits below 1e-4, since float32 errs by up to 3e-5 on dark
+    texels.
+    """
     return 64 if tolerance < 1e-4 else 32
 
 
@@ -66,12 +70,12 @@ def precision_for(tolerance: float) -> int:
 class LevelPlan:
     """The plan of one level.
 
-    size        texels a face edge
+    size        texels of a face edge
     roughness   perceptual roughness
     parameters  parameters of the NDF
-    grid        nodes a face edge of the anterpolated source; 0 for the mean over each texel (r = 0) and for samples
-    cuts        quadrature nodes a source texel's edge in the exact sum
-    samples     importance samples a texel, 0 for none
+    grid        nodes of a face edge of the anterpolated source; 0 for the mean over each texel (r = 0) and for samples
+    cuts        quadrature nodes of a source texel's edge in the exact sum
+    samples     importance samples for each texel, 0 for none
     """
 
     size: int
@@ -88,28 +92,32 @@ class LevelPlan:
 
     @property
     def pairs(self) -> int:
-        """Lobe evaluations of the convolution. Pairs that it may skip count in proportion to the near cap."""
+        """Number of lobe evaluations of the convolution. Pairs that it may skip count in proportion to the near cap."""
         return self.outputs * self.samples or pairs_of(self.outputs, self.grid, max(self.roughness**2, 1e-5))
 
 
 def pairs_of(outputs: int, grid: int, alpha: float, horizon: float | None = None) -> int:
-    """Pairs of `outputs` directions and the sources of a grid, over the parts into which the lobe is split."""
+    """Return the number of pairs of output directions and grid sources, over the parts into which the lobe is split.
+
+    outputs: number of directions. grid: nodes of a face edge. alpha, horizon: as in `parts_for`.
+    """
     return int(outputs * 6 * sum(part.grid**2 * part.share for part in parts_for(grid, alpha, horizon)) if grid else 0)
 
 
 def kink(horizon: float) -> float:
-    """Effective strength of the lobe's kink at the horizon, from `horizon`, the α at which GGX has the same.
+    """Return the effective strength of the lobe's kink at the horizon.
 
-    The rim of a sheen lobe crosses so many nodes that their errors cancel, except under hard panels, which a
-    certificate finds; so strengths above 1 count less.
+    horizon: the α at which GGX has the same kink. The rim of a sheen lobe crosses so many nodes that their errors
+    cancel, except under hard panels, which a certificate finds; so strengths above 1 count less.
     """
     return horizon if horizon <= 1 else horizon**0.6
 
 
 def grid_size(alpha: float, tolerance: float, horizon: float | None = None) -> int:
-    """Nodes a face edge that a lobe of width α needs for a p99 texel error within a tolerance, a multiple of 16.
+    """Return the nodes of a face edge, a multiple of 16, with which a lobe meets a tolerance of the 99th percentile.
 
-    horizon: the α at which GGX's kink at the horizon is as strong as the lobe's; by default α itself.
+    alpha: width of the lobe. tolerance: of the texel error. horizon: the α at which GGX's kink at the horizon is as
+    strong as the lobe's; by default alpha itself.
     """
     finer = (1e-3 / tolerance) ** (1 / RATE)
     n = max(
@@ -128,22 +136,25 @@ TEXELS_A_LAUNCH = 1 << 20
 
 
 def output_nodes(n: int, alpha: float) -> int:
-    """Nodes an edge of the grid at which a level is convolved before it is read at texels.
+    """Return the nodes of an edge of the grid at which a level is convolved before it is interpolated at texels.
 
-    n: nodes an edge of the lobe's source grid. The result is a quarter finer than the lobe needs, for a fourth of the
-    error. The convolved light has no kink at the horizon any more.
+    n: nodes of an edge of the lobe's source grid. The result is a quarter finer than the lobe needs, for a fourth of
+    the error. The convolved light has no kink at the horizon any more.
     """
     finer = (n - 2 * BEYOND) / (SHARP / alpha + MARGIN)
     return nodes_for(1.25 * min(n - 2 * BEYOND, max(finer, 1.0) * (SHARP / alpha + FLOOR)))
 
 
 def spacing(grid: int) -> float:
-    """Angle between the nodes of a grid, in radians."""
+    """Return the angle between the nodes of a grid, in radians.
+
+    grid: nodes of a face edge.
+    """
     return math.pi / 2 / (grid - 2 * BEYOND)
 
 
 def nodes_for(n: float) -> int:
-    """Nodes an edge of the smallest grid with at least n of them on a face, a multiple of 16."""
+    """Return the smallest number of nodes of a face edge that is at least n and a multiple of 16."""
     return max(16 * math.ceil((n + 2 * BEYOND) / 16), 32)
 
 
@@ -163,16 +174,16 @@ CENTRED = (4, 2, 1)
 
 
 def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0, centred: int = 1) -> int:
-    """Quadrature nodes a texel edge to begin with, so that integrating a lobe over a texel errs less than tolerance/10.
+    """Return the first number of quadrature nodes of a texel edge to try, for an error below tolerance/10.
 
-    texel: its angle in radians. alpha: the lobe's width. share: largest share of all energy that a texel holds.
-    centred: largest number of parts an edge for masses at corrected centres, 0 where there are none.
+    texel: angle of a texel in radians. alpha: width of the lobe. share: largest share of all energy that a texel holds.
+    centred: largest number of parts of an edge for masses at corrected centres, 0 where there are none.
 
-    Masses at the corrected centres of c × c parts of each texel, c up to `centred`, leave CENTRE_ERROR
-    (texel/α/c/.34)⁶; an uncorrected midpoint 1.3e-3·(texel/α/.34)²; pairs of Gauss points in m cells an edge about
-    1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this bounds by its fourth power. The kink of (n·l)₊ costs a texel
-    with `share` of all energy share·texel/(8 cuts²) where it sets. No formula gives the cost of a whole panel that sets
-    at once: a certificate doubles the cuts until nothing changes.
+    Masses at the corrected centres of c × c parts of each texel, c up to `centred`, have an error of CENTRE_ERROR
+    (texel/α/c/.34)⁶; an uncorrected midpoint of 1.3e-3·(texel/α/.34)²; pairs of Gauss points in m cells of an edge of
+    about 1.3e-3·(.02·texel/α/m/.34)·(texel/α/m/.34)³, which this function bounds by its fourth power. The kink of
+    (n·l)₊ adds share·texel/(8 cuts²) for a texel with `share` of all energy at the horizon. No formula gives the error
+    of a whole bright panel at the horizon: a certificate doubles the cuts until nothing changes.
     """
     x = texel / alpha / 0.34
     kinked = math.sqrt(2.5 * share * texel / tolerance)
@@ -186,17 +197,20 @@ def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0, c
 
 
 def cuts_error(texel: float, alpha: float, cuts: int, centred: int = 1) -> float:
-    """Error of integrating a smooth lobe over texels with `cuts` nodes an edge, by the laws of `cuts_for`."""
+    """Return the error of integrating a smooth lobe over texels with `cuts` nodes of an edge, by the laws of
+    `cuts_for`.
+    """
     x = texel / alpha / 0.34
     return CENTRE_ERROR * (x / cuts) ** 6 if cuts <= centred else 2.6e-5 * (2 * x / cuts) ** 4
 
 
 def bright_cuts(texel: float, horizon: float, tolerance: float, shares: np.ndarray) -> np.ndarray:
-    """Nodes an edge of bright texels, powers of two, (m,) integers.
+    """Return the nodes of an edge of bright texels, powers of two, (m,) integers.
 
-    shares: (m,) shares of all energy that they hold. horizon: strength of the lobe's kink at the horizon; a lobe with
-    little there needs no more than 2. Where a bright texel sets, the kink of (n·l)₊ costs share·texel/(8 cuts²) of the
-    mean. Texels a thousand times darker than the mean are held to the tolerance too, so the factor is 10³/8.
+    texel: angle of a texel in radians. horizon: strength of the lobe's kink at the horizon; a lobe with a small value
+    there needs no more than 2 nodes. shares: (m,) shares of all energy that the texels hold. Where a bright texel
+    crosses the horizon, the kink of (n·l)₊ has an error of share·texel/(8 cuts²) of the mean. Texels a thousand times
+    darker than the mean must meet the tolerance too, so the factor is 10³/8.
     """
     if horizon <= SHARP_ENOUGH:
         return np.full(len(shares), 2)
@@ -214,7 +228,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of a lobe, on a grid of `grid` nodes a face edge. The parts of a lobe add up to it.
+    """A part of a lobe, on a grid of `grid` nodes of a face edge. The parts of a lobe add up to it.
 
     inner  the part lies beyond this window, None for no bound
     outer  the part lies within this window, None for no bound
@@ -231,7 +245,7 @@ class Part:
 
     @property
     def work(self) -> float:
-        """Products for each output, in units of a transformed sum over one node."""
+        """Number of products for each output, in units of a transformed sum over one node."""
         return self.grid**2 * (close_work(math.sqrt(self.outer.q1), self.grid) if self.outer else 1.0)
 
 
@@ -240,9 +254,10 @@ TILE_REACH = 4.0
 
 
 def close_work(chord: float, n: int) -> float:
-    """Cost of a sum without transforms over the nodes within a chord, relative to a transformed sum over all nodes.
+    """Return the cost of summing the nodes within a chord without transforms, relative to a transformed sum over all
+    nodes.
 
-    It is eight times the cost a node, over chord²/4 of the sphere. n: nodes an edge of the grid.
+    A node costs eight times as much, and chord²/4 of the sphere is summed. n: nodes of an edge of the grid.
     """
     return 2 * (chord + TILE_REACH * math.pi / 2 / n) ** 2
 
@@ -254,10 +269,10 @@ the error as it is."""
 
 @lru_cache(maxsize=4096)
 def parts_for(n: int, alpha: float, horizon: float | None = None) -> tuple[Part, ...]:
-    """The cheapest partition found of a lobe whose fine grid has n × n nodes a face.
+    """Return the cheapest partition found of a lobe whose fine grid has n × n nodes on a face.
 
     A sharp lobe needs its fine grid only near r. The number of near pairs grows with θ², where θ is the angle at which
-    a window ends. The rest of the lobe is smooth on the scale θ, so its grid shrinks like 1/θ, and it may be parted
+    a window ends. The rest of the lobe is smooth on the scale θ, so its grid shrinks like 1/θ, and it may be divided
     again. The last grid must also resolve the lobe's kink at the horizon. A finer n, for a tighter tolerance, refines
     all grids alike.
     """
@@ -294,7 +309,7 @@ def parts_for(n: int, alpha: float, horizon: float | None = None) -> tuple[Part,
 
 
 def plan_chain(chain: Chain, texel: float, share: float = 0.0, centred: int = 1) -> tuple[LevelPlan, ...]:
-    """The plans of a chain's levels.
+    """Plan the levels of a chain.
 
     texel: angle of the source's texels in radians. share: largest share of the source's energy that a texel holds,
     without the bright ones. centred: as in `cuts_for`.
@@ -318,7 +333,10 @@ def plan_chain(chain: Chain, texel: float, share: float = 0.0, centred: int = 1)
 
 
 def refined(level: LevelPlan, missed: float, horizon: float) -> LevelPlan | None:
-    """The same level on a finer grid; None where the finest was tried. missed: the level's error over the tolerance."""
+    """Return the same level on a finer grid, or None where the finest grid was tried.
+
+    missed: the level's error divided by the tolerance. horizon: strength of the lobe's kink at the horizon.
+    """
     order = RATE if horizon <= SHARP_ENOUGH else 2
     growth = min(max((1.5 * missed) ** (1 / order), GROWTH[0]), GROWTH[1]) if missed < math.inf else GROWTH[1]
     grid = min(16 * math.ceil(level.grid * growth / 16), LARGEST_GRID)

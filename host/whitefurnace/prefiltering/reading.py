@@ -75,10 +75,10 @@ def stored(values: np.ndarray, format: str) -> np.ndarray:
 
 
 def taps(size: int, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices (4, m) and weights (4, m) of a seamless bilinear read of a cube of `size` in directions (3, m).
+    """Return flat indices (4, m) and weights (4, m) of a seamless bilinear read of a cube in directions d (3, m).
 
-    Beyond an edge the read takes the texel of the next face that meets it there. The texel that is missing at a corner
-    is the mean of the other three [OpenGL 4.6, 8.13].
+    size: texels of a face edge. Beyond an edge the read takes the texel of the next face that meets it there. The texel
+    that is missing at a corner is the mean of the other three [OpenGL 4.6, 8.13].
     """
     face, s, t = face_coordinates(d)
     x, y = (s + 1) / 2 * size - 0.5, (t + 1) / 2 * size - 0.5
@@ -105,14 +105,16 @@ def taps(size: int, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def bilinear(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """A cube level (6, s, s, 3) read bilinearly in directions d (3, m): (m, 3)."""
+    """Read a cube level (6, s, s, 3) bilinearly in directions d (3, m): (m, 3)."""
     index, weights = taps(texels.shape[1], d)
     return np.einsum("km,kmc->mc", weights, texels.reshape(-1, 3)[index].astype(np.float64))
 
 
 def hats(roughness: np.ndarray, recipe: Chain) -> np.ndarray:
-    """Weights of the levels of a chain in reads at roughness values (r,), linear in lod between two levels: (r,
-    levels)."""
+    """Return the weights of the levels of a chain in reads at roughness values (r,): (r, levels).
+
+    A read is linear in lod between two levels.
+    """
     lod = np.array([recipe.lod(float(r)) for r in roughness])
     return np.maximum(1 - np.abs(lod[:, None] - np.arange(len(recipe.levels))), 0)
 
@@ -121,7 +123,7 @@ def hats(roughness: np.ndarray, recipe: Chain) -> np.ndarray:
 
 
 def halved(env: Environment) -> Environment | None:
-    """The environment over texels twice as large, each the exact mean of four; None where a size is odd."""
+    """Return the environment over texels twice as large, each the exact mean of four; None where a size is odd."""
     rows, columns = env.texels.shape[-3:-1]
     if rows % 2 or columns % 2:
         return None
@@ -138,12 +140,12 @@ def halved(env: Environment) -> Environment | None:
 
 
 def single(roughness: float) -> Mixture:
-    """One lobe as a mixture."""
+    """Return the mixture that is one lobe of this perceptual roughness."""
     return ((1.0, roughness),)
 
 
 class Exact:
-    """Exact values of a chain's lobes in any direction, integrated over the largest texels that each lobe allows."""
+    """Exact values of a chain's lobes in any direction, integrated over texels as large as each lobe allows."""
 
     def __init__(self, device: Device, env: Environment, recipe: Chain) -> None:
         self.device, self.env, self.recipe = device, env, recipe
@@ -169,13 +171,15 @@ class Exact:
         return self._lobes[mixture]
 
     def convolver(self, k: int, precision: int = 32) -> Convolver:
-        """The convolver of the k-th source, where 0 is the environment itself."""
+        """Return the convolver of the k-th source, where 0 is the environment itself and each next one has larger
+        texels.
+        """
         if (k, precision) not in self._convolvers:
             self._convolvers[k, precision] = Convolver(self.device, self._sources[k][1], precision=precision)
         return self._convolvers[k, precision]
 
     def lobes(self, wanted: Sequence[tuple[Mixture, np.ndarray]]) -> list[np.ndarray]:
-        """Exact values of lobes in given directions, (m, 3) float64 for each (mixture, directions (3, m)).
+        """Return exact values of lobes in given directions, (m, 3) float64 for each (mixture, directions (3, m)).
 
         At roughness 0 the value is the radiance. Raises UnsupportedError for a lobe that underflows.
         """
@@ -215,11 +219,11 @@ class Exact:
         return values
 
     def radiance(self, d: np.ndarray) -> np.ndarray:
-        """Radiance (m, 3) of the environment's texel in each direction, with its rotation."""
+        """Return the radiance (m, 3) of the environment's texel in each direction d (3, m), with its rotation."""
         return radiance_at(self.env, d)
 
     def means(self, size: int, index: np.ndarray) -> np.ndarray:
-        """Exact means (m, 3) over texels of a cube of `size`, by flat index, as level 0 stores them."""
+        """Return exact means (m, 3) over texels of a cube of `size`, by flat index, as level 0 stores them."""
         convolver = self.convolver(0)
         return convolver.exact_means(Shape(False, size), index) / convolver.scale
 
@@ -241,7 +245,7 @@ class Interpolated:
         self.values = np.log(np.stack(values) + self.floor)  # (nodes, m, 3)
 
     def at(self, roughness: Sequence[float] | np.ndarray) -> np.ndarray:
-        """Values (r, m, 3) float64 at roughness values; at r = 0 the radiance of the environment."""
+        """Return values (r, m, 3) float64 at perceptual roughness values (r,); at 0 the radiance of the environment."""
         out = []
         for r in roughness:
             if r == 0:
@@ -260,13 +264,13 @@ class Interpolated:
 
 @dataclass(frozen=True)
 class AsRead:
-    """The error of a chain as it is read, split into the PARTS that were measured.
+    """The error of a chain as an engine reads it, split into the PARTS that were measured.
 
-    sizes      face edge of each level; `fit` and `format` of the chain
+    sizes      face edge of each level in texels
     roughness  (n,) perceptual roughness values of the reads
-    rms, p95   for each part (n,): root mean square and 95th percentile, over directions uniform on the sphere, of the
-               texel error, the maximum over channels of |x - ref| / max(ref, 1e-3 · mean); ref is the exact lobe in the
-               direction, and x - ref the change that the part makes
+    rms, p95   for each part (n,): root mean square and 95th percentile of the texel error, over directions that are
+               uniform on the sphere. The texel error is the maximum over channels of |x - ref| / max(ref, 1e-3 · mean),
+               where ref is the exact lobe in the direction, and x - ref the change that the part makes
     """
 
     sizes: tuple[int, ...]
@@ -277,11 +281,11 @@ class AsRead:
     p95: Mapping[str, np.ndarray]
 
     def mean(self, part: str = "all") -> float:
-        """Mean of a part's RMS error over r, uniform from SMOOTHEST to 1."""
+        """Return the mean of a part's RMS error over roughness, uniform from SMOOTHEST to 1."""
         return float(self.rms[part].mean())
 
     def data(self) -> dict[str, Any]:
-        """The errors as manifests and JSON rows hold them."""
+        """Return the errors as manifests and JSON rows hold them."""
         parts = {
             part: {"mean": float(self.rms[part].mean()), "p95": float(self.p95[part].mean())}
             for part in PARTS
@@ -303,20 +307,20 @@ class AsRead:
 
 
 def scored() -> np.ndarray:
-    """The (SCORED,) roughness values at which reads are scored."""
+    """Return the (SCORED,) roughness values at which reads are measured."""
     return SMOOTHEST + (1 - SMOOTHEST) * (np.arange(SCORED) + 0.5) / SCORED
 
 
 def random_directions(count: int = DIRECTIONS, seed: int = 0) -> np.ndarray:
-    """Directions (3, count), uniform over the sphere."""
+    """Draw directions (3, count) that are uniform over the sphere."""
     d = np.random.default_rng(seed).normal(size=(3, count))
     return d / np.sqrt((d * d).sum(0))
 
 
 class Reader:
-    """Measures chains of one environment as they are read; integrals that they share are computed once.
+    """Measures chains of one environment as engines read them; integrals that they share are computed once.
 
-    recipes: chains of one NDF. directions: number of random directions, drawn from `seed`. Raises InputError,
+    recipes: chains of one NDF. directions: number of random directions, drawn from `seed`. Raises InputError and
     DeviceError.
     """
 
@@ -331,7 +335,7 @@ class Reader:
         self.reference = self.at_directions.at(scored())
 
     def mixtures(self, recipe: Chain) -> list[Mixture]:
-        """The mixture of lobes of each level, as (weight, roughness) pairs; ((1, 0),) is the mirror."""
+        """Return the mixture of lobes of each level, as (weight, roughness) pairs; ((1, 0),) is a mirror."""
         own = [single(r) for _, r in recipe.levels]
         if recipe.fit != "read":
             return own
@@ -347,12 +351,11 @@ class Reader:
         kept: Sequence[np.ndarray] | None = None,
         texels: bool = True,
     ) -> AsRead:
-        """The error of a chain as it is read.
+        """Measure the error of a chain as engines read it.
 
-        levels: its baked levels, (6, s, s, 3) each, with `errors`, their stated errors; without them the levels are
-        exact in every texel. format: one of FORMATS. kept: the levels after a round trip through the format; without
-        it, the format is applied here. texels: False leaves out the error within a level, which costs almost nothing
-        then.
+        levels: its baked levels, (6, s, s, 3) each; without them the levels are exact in every texel. errors: their
+        stated errors. format: one of FORMATS. kept: the levels after a round trip through the format; without them, the
+        format is applied here. texels: False leaves out the error within a level, which makes the measurement fast.
         """
         mixtures = self.mixtures(recipe)
         weights = hats(scored(), recipe)
@@ -418,10 +421,10 @@ class Reader:
 
 
 def alternatives(recipe: Chain) -> list[Chain]:
-    """The plans that a chain can be compared with: own lobes and `--fit read`, each with the chain's number of levels,
-    half as many more, and twice as many.
+    """Return the chains that a chain can be compared with: with own lobes and with `--fit read`.
 
-    Where there are more levels than halvings, the last levels keep the last size.
+    Each has as many levels as the chain, half as many more, or twice as many. Where there are more levels than
+    halvings, the last levels keep the last size.
     """
     count = len(recipe.levels)
     found = []
@@ -431,8 +434,10 @@ def alternatives(recipe: Chain) -> list[Chain]:
 
 
 def compared(device: Device, env: Environment, recipe: Chain, *, alone: bool = False) -> list[AsRead]:
-    """The errors of `alternatives` as they are read, with exact levels. alone: measure the plan only, where an engine
-    allows no other."""
+    """Measure the errors of `alternatives` as engines read them, with exact levels.
+
+    alone: True measures the recipe only, for an engine that allows no other.
+    """
     choices = [recipe] if alone or recipe.only or recipe.levels[-1][1] > 1 else alternatives(recipe)
     reader = Reader(device, env, *choices)
     return [reader.as_read(choice, texels=len(choice.levels) == len(recipe.levels)) for choice in choices]

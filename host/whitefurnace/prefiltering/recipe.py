@@ -26,10 +26,10 @@ DFG_SIZE = 128
 
 
 def tolerance_of(tolerance: float | None, quality: str | None) -> float:
-    """Tolerance of the levels that a tolerance or a quality asks for, 1e-3 where neither is given.
+    """Return the tolerance of the levels for a tolerance or a quality, 1e-3 where neither is given.
 
-    tolerance: in TOLERANCE_RANGE. quality: a name of QUALITIES. Raises UsageError for both at once, a name that is
-    unknown or a tolerance out of range.
+    tolerance: a number in TOLERANCE_RANGE. quality: a name of QUALITIES. Raises UsageError for both at once, an unknown
+    name or a tolerance out of range.
     """
     if tolerance is not None and quality is not None:
         raise UsageError("give a tolerance or a quality, not both")
@@ -46,7 +46,7 @@ def tolerance_of(tolerance: float | None, quality: str | None) -> float:
 
 
 def samples_of(samples: int | None, tolerance: float | None, quality: str | None = None) -> int | None:
-    """Number of samples a texel that `--samples` asks for, None where it asks for none.
+    """Return the number of importance samples for each texel, or None where `samples` is None.
 
     Samples replace the tolerance. Raises UsageError for samples out of SAMPLES_RANGE or together with a tolerance or a
     quality.
@@ -70,12 +70,14 @@ def _power_of_two(value: int, what: str) -> int:
 
 
 def roughness_of_level(k: int, levels: int) -> float:
-    """Perceptual roughness of level k of n: r = 1 - √(1 - k/(n - 1)), the mapping of Filament and three.js."""
+    """Return the perceptual roughness of level k of n: r = 1 - √(1 - k/(n - 1)), as in Filament and three.js."""
     return roughness_of_lod(k, levels)
 
 
 def roughness_of_lod(lod: float, levels: int) -> float:
-    """Perceptual roughness that engines read at a lod in [0, levels - 1], which may lie between two levels."""
+    """Return the perceptual roughness that engines read at a lod in [0, levels - 1], which may lie between two
+    levels.
+    """
     return 0.0 if levels == 1 else 1 - math.sqrt(max(1 - lod / (levels - 1), 0.0))
 
 
@@ -99,23 +101,27 @@ class Lods:
     """The mapping between the perceptual roughness of a surface and the lod that an engine reads.
 
     lod     the engine's formula lod(r); None for the mapping of Filament and three.js
-    follow  True: levels past r = 1 have the lobe of that α, as the engine's own filter makes them; False: that of r = 1
+    follow  True if levels past r = 1 have the lobe of that α, as the engine's own filter makes them; False if they have
+            the lobe of r = 1
     """
 
     lod: Expression | None = None
     follow: bool = False
 
     def at(self, roughness: float, levels: int, width: int) -> float:
-        """The lod in [0, levels - 1] that the engine reads for a perceptual roughness. width: texels an edge of level
-        0."""
+        """Return the lod in [0, levels - 1] that the engine reads for a perceptual roughness.
+
+        width: texels of an edge of level 0.
+        """
         if self.lod is None or levels == 1:
             return lod_of_roughness(roughness, levels) if levels > 1 else 0.0
         return min(max(self._lod(roughness, levels, width), 0.0), levels - 1.0)
 
     def roughness(self, lod: float, levels: int, width: int) -> float:
-        """Perceptual roughness of a lod, the inverse of `at`; 0 for lod 0, where engines have the image itself.
+        """Return the perceptual roughness of a lod, the inverse of `at`.
 
-        Raises UsageError where lod(r) falls as r grows, or is no positive number.
+        It is 0 for lod 0, where engines have the image itself. width: texels of an edge of level 0. Raises UsageError
+        where lod(r) falls as r grows, or is not a positive number.
         """
         if self.lod is None or levels == 1:
             return roughness_of_lod(lod, levels)
@@ -170,13 +176,14 @@ CERTIFY_RANGE = (CERTIFIED, 1 << 20)
 class Chain:
     """A specular chain, whose sizes halve from `size` to `min_size` and whose roughness follows `lods`.
 
-    ndf       the NDF and its given parameters
-    tolerance bound on the stated error of every level
-    count     number of levels, None for as many as halving gives; sizes after `min_size` stay there
-    fit       "read" for levels fitted so that interpolated roughness values are most accurate (level_fit.py), else None
-    samples   importance samples a texel, for every level r > 0 and for irradiance; None for what the tolerance needs
-    certify   uniform texels of each certificate, 0 for none
-    only      first and last level that are made, None for all of them; lods count these
+    ndf        the NDF and its given parameters
+    tolerance  bound on the stated error of every level
+    count      number of levels, None for as many as halving gives; sizes after `min_size` stay at it
+    fit        "read" if levels are fitted so that interpolated roughness values are most accurate (level_fit.py), else
+               None
+    samples    importance samples for each texel of irradiance and of every level r > 0; None to meet the tolerance
+    certify    number of uniform texels of each certificate, 0 for none
+    only       first and last level that are made, None for all of them; lods count these
     """
 
     ndf: Chosen
@@ -192,7 +199,7 @@ class Chain:
 
     @cached_property
     def all_levels(self) -> tuple[tuple[int, float], ...]:
-        """(size, perceptual roughness) of every level, also of those that are not made."""
+        """(size, perceptual roughness) of every level, including those that are not made."""
         n = self.count or int(math.log2(self.size // self.min_size)) + 1
         return tuple((max(self.size >> k, self.min_size), self.lods.roughness(k, n, self.size)) for k in range(n))
 
@@ -207,12 +214,12 @@ class Chain:
         return self.only[0] if self.only else 0
 
     def lod(self, roughness: float) -> float:
-        """The lod, among the levels that are made, at which the engine reads a perceptual roughness."""
+        """Return the lod, among the levels that are made, at which the engine reads a perceptual roughness."""
         lod = self.lods.at(roughness, len(self.all_levels), self.size)
         return lod if self.only is None else min(max(lod - self.first, 0.0), len(self.levels) - 1.0)
 
     def parameters(self, roughness: float) -> dict[str, float]:
-        """Parameters of the NDF at a perceptual roughness."""
+        """Return the parameters of the NDF at a perceptual roughness."""
         entry = self.ndf.model
         assert entry.from_roughness is not None
         given = {name: value for name, value in self.ndf.given.items() if not isinstance(value, tuple)}
@@ -222,7 +229,7 @@ class Chain:
         return {**defaults, **entry.from_roughness(min(roughness, 1.0)), **given}
 
     def canonical(self) -> dict[str, Any]:
-        """The chain as a JSON object, equal for equal chains, as recipes and keys contain it."""
+        """Return the chain as a JSON object for recipes and keys, equal for equal chains."""
         return {
             "ndf": self.ndf.canonical(),
             "size": self.size,

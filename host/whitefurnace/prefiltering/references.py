@@ -46,17 +46,18 @@ class Reference:
 
     @property
     def index(self) -> np.ndarray:
-        """Indices of all texels of the sample."""
+        """Flat indices of all texels of the sample."""
         return np.concatenate(self.sample)
 
 
 def references_of(convolver: Convolver, jobs: Sequence[Job], tolerance: float, certify: int) -> list[Reference]:
-    """The references of levels, in the order of `jobs`.
+    """Compute the references of levels, in the order of `jobs`.
 
-    A lobe is integrated over every texel, or over a much finer grid than its level's where that has half as many nodes.
-    The grid is compared on the PROBES darkest texels with every texel, cut twice as finely where the lobe has a kink
-    that they would not show; the change there is the doubt. While the doubt is more than a tenth of the tolerance,
-    texels replace the grid, and then twice the nodes. Lobes with the same cuts share one pass over the source.
+    A lobe is integrated over every texel, or over a much finer grid than its level's if that has at most half as many
+    nodes. The grid is compared with every texel on the PROBES darkest texels of the sample, cut twice as finely where
+    the lobe has a kink that would otherwise not show; the difference is the doubt. While the doubt is more than a tenth
+    of the tolerance, texels replace the grid, and then the number of nodes is doubled. Lobes with the same cuts share
+    one pass over the source.
 
     certify: number of uniform texels of each sample.
     """

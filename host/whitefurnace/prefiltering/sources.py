@@ -1,5 +1,4 @@
-"""Represents one environment on a device: its brightest texels apart, the rest as lists of nodes and as anterpolated
-grids."""
+"""Represents one environment on a device: bright texels apart, the rest as lists of nodes and as anterpolated grids."""
 
 from __future__ import annotations
 
@@ -109,8 +108,10 @@ class Texels:
 
     @property
     def centred(self) -> int:
-        """Largest number of parts an edge into which texels may be cut for masses at corrected centres; 0 where the
-        image is too small for the stencil."""
+        """Largest number of parts of an edge into which texels may be cut for masses at corrected centres.
+
+        It is 0 where the image is too small for the stencil of the correction.
+        """
         if self.rows < 16 or self.columns < 16 or (self.latlong and self.columns % 2):
             return 0
         return next(c for c in planning.CENTRED if c == 1 or self.nodes(c) <= CENTRED_NODES)
@@ -168,10 +169,10 @@ class Texels:
         return self._corrected[cuts]
 
     def arguments(self, cuts: int, whole: bool = True) -> tuple[Any, ...]:
-        """Arguments of the kernels that read texels.
+        """Return the arguments of the kernels that read texels.
 
-        cuts: nodes an edge of each texel. whole: True if the kernel reads all texels together, so that masses may be
-        corrected by their neighbours'.
+        cuts: nodes of the edge of each texel. whole: True if the kernel reads all texels together, so that masses may
+        be corrected by those of neighbours.
         """
         centred = whole and cuts <= self.centred and cuts in planning.CENTRED
         rows, columns = self._table(cuts, centred)
@@ -187,22 +188,22 @@ class Texels:
         )
 
     def kernel(self, name: str) -> Kernel:
-        """A kernel of the texels' program."""
+        """Return a kernel of the texels' program by its name."""
         return self.device.build(
             self._program.text, {"W": self.device.lanes(self.precision), "T": 1, "PRECISION": self.precision}
         ).kernel(name)
 
     def launch(self, name: str, count: int, args: Sequence[Any], times: int = 1) -> None:
-        """A kernel of the texels' program over at least `count` work items, `times` of them along a second axis."""
+        """Launch a kernel of the texels' program over at least `count` work items, and `times` along a second axis."""
         size = self.device.scalar_size if name in LIGHT else self.device.local_size
         self.device.launch(self.kernel(name), (-(-count // size) * size, times), args, (size, 1))
 
     def nodes(self, cuts: int) -> int:
-        """Quadrature nodes of the whole source at `cuts` an edge of each texel."""
+        """Return the number of quadrature nodes of the whole source, at `cuts` of an edge of each texel."""
         return self.faces * self.rows * self.columns * cuts * cuts
 
     def bands(self, cuts: int) -> Iterator[tuple[Buffer, int, float]]:
-        """Every node of the clipped source, in bands of whole rows: (list, number of nodes in it, share done)."""
+        """Yield every node of the clipped source in bands of whole rows: (list, number of nodes in it, share done)."""
         width, rows = self.columns * cuts, self.faces * self.rows * cuts
         band = min(max(planning.NODES_A_BAND // width, 1), rows)
         listed = self.device.empty((band * width, 8), self.kind)
@@ -212,9 +213,9 @@ class Texels:
             yield listed, count, min(first + band, rows) / rows
 
     def bright_list(self, lobe: Lobe, tolerance: float, finer: int = 1) -> Buffer | None:
-        """The excess of the bright texels as one list of nodes, None where nothing was clipped.
+        """Return the excess of the bright texels as one list of nodes, None where nothing was clipped.
 
-        A texel gets more nodes the more energy it holds. finer: factor on the nodes an edge.
+        A texel gets more nodes the more energy it holds. finer: factor on the nodes of an edge.
         """
         if not len(self._index):
             return None
@@ -246,14 +247,16 @@ class Texels:
     # ------------------------------------------------------------------------------------------- grids
 
     def prepare(self, n: int, cuts: int) -> None:
-        """Announces the finest grid (n nodes an edge) that a set of levels needs and the texel cuts for it, so that no
-        grid is made from the texels twice."""
+        """Announce the finest grid that a set of levels needs, so that no grid is made from the texels twice.
+
+        n: nodes of its edge. cuts: nodes of each texel's edge for it.
+        """
         self.cuts = max(self.cuts, cuts)
         self._finest(n)
 
     @property
     def fineness(self) -> tuple[int, int]:
-        """(nodes a face edge of the finest grid so far, the cuts it was made with), 0 for no grid."""
+        """Nodes of a face edge of the finest grid so far, 0 for none, and the cuts with which it was made."""
         return self._fine[:2] if self._fine else (0, 0)
 
     def _finest(self, n: int) -> tuple[int, int, Buffer]:
@@ -276,8 +279,9 @@ class Texels:
         return self._fine
 
     def grid(self, n: int) -> Buffer:
-        """The n × n grid of each face, (6, n, n, 4): ∫ (L, 1) φ_a dω of its nodes, without the excess of the bright
-        texels."""
+        """Return the n × n grid of each face, (6, n, n, 4): ∫ (L, 1) φ_a dω for its nodes, without the excess of
+        bright texels.
+        """
         fine, _, grid = self._finest(n)
         if n not in self._grids:
             matrix, first, last = (self.device.array(a) for a in coarsening(fine, n, self.kind.char))
@@ -292,7 +296,7 @@ class Texels:
         return self._grids[n]
 
     def grid_list(self, n: int) -> Buffer:
-        """The n × n grid as a list of nodes."""
+        """Return the n × n grid as a list of nodes."""
         listed = self.device.empty((6 * n * n, 8), self.kind)
         self.launch(
             "grid_list",

@@ -1,4 +1,4 @@
-"""Convolves by the symmetries of the cube: the orbits of grids and levels, and the launches of `octahedral.cl`."""
+"""Convolves with the symmetries of the cube: the orbits of grids and levels, and the launches of `octahedral.cl`."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ MOST_PLACES = 512
 
 @dataclass(frozen=True)
 class Orbits:
-    """Outputs of a level, one of every orbit of its symmetries.
+    """Texels of a level, one for every orbit under its symmetries.
 
-    first, count  the range of outputs; `padded`: their number with padding to whole lanes
+    first, count  the range of texels
+    padded        their number with padding to whole lanes
     exchanges     number of exchanges of axes that map the level onto itself
-    number        (padded, 2) int32, `direction` (3, padded) float64, as `octahedral.cl` reads them
+    number        (padded, 2) int32, as `octahedral.cl` reads it
+    direction     (3, padded) float64 unit directions
     """
 
     shape: Shape
@@ -44,8 +46,10 @@ class Orbits:
 
 @lru_cache(maxsize=64)
 def orbits(shape: Shape, lanes: int, most: int) -> tuple[Orbits, ...]:
-    """The orbits of a level with neighbours next to each other, in parts of at most `most`, padded to multiples of
-    `lanes`."""
+    """Return the orbits of a level in parts of at most `most`, padded to multiples of `lanes`.
+
+    Neighbours on the sphere stay next to each other.
+    """
     if shape.latlong:
         rows, columns = shape.dims
         i, j = np.mgrid[: rows // 2, : -(-columns // 8)].reshape(2, -1)
@@ -80,7 +84,7 @@ def orbits(shape: Shape, lanes: int, most: int) -> tuple[Orbits, ...]:
 
 
 class Classes:
-    """The classes of one grid on a device. Its arrays are made when they are first used."""
+    """The classes of nodes of one grid on a device. Its arrays are made when they are first used."""
 
     def __init__(self, symmetries: Octahedral, n: int, grid: Buffer, exchanges: int) -> None:
         self.symmetries, self.n, self.grid, self.exchanges = symmetries, n, grid, exchanges
@@ -93,20 +97,22 @@ class Classes:
 
     @cached_property
     def node(self) -> Buffer:
-        """Direction and symmetric weight of each class, (classes, 4)."""
+        """Direction and symmetric weight of each class, (classes, 4), made on the device."""
         node = self.symmetries.device.empty((self.count, 4), self.symmetries.kind)
         self._launch("class_nodes", self.count, node, self.symmetries.tangents(self.n))
         return node
 
     @cached_property
     def moment(self) -> Buffer:
-        """Transforms of each class's images over the reflections, (8, classes, 3 exchanges)."""
+        """Transforms of each class's images over the reflections, (8, classes, 3 exchanges), made on the device."""
         moment = self.symmetries.device.empty((8, self.count, 3 * self.exchanges), self.symmetries.kind)
         self._launch("class_moments", self.count, moment)
         return moment
 
     def images(self) -> Iterator[tuple[int, Buffer]]:
-        """(first class, images (exchanges, count, 24)) in pieces of at most PIECE classes; a single piece is kept."""
+        """Yield (first class, images (exchanges, count, 24)) in pieces of at most PIECE classes; a single piece is
+        kept.
+        """
         if self._images is not None:
             yield 0, self._images
             return
@@ -123,7 +129,7 @@ class Classes:
 def tile_bounds(n: int) -> np.ndarray:
     """Return the centre and radius of every run of classes of the n × n grid, then of each tile in the run.
 
-    The shape is (runs, 1 + tiles in a run, 4); the order of the classes is that of `class_numbers` in `octahedral.cl`.
+    The shape is (runs, 1 + tiles in a run, 4). The order of the classes is that of `class_numbers` in `octahedral.cl`.
     """
     half, tiles = n // 2, RUN_EDGE // TILE_EDGE
     index = np.arange(half * half)
@@ -156,7 +162,7 @@ class Octahedral:
         ).kernel(name)
 
     def launch(self, name: str, exchanges: int, count: int, args: Sequence[Any]) -> None:
-        """A kernel over at least `count` work items."""
+        """Launch a kernel over at least `count` work items."""
         size = self.device.scalar_size
         self.device.launch(self._kernel(name, exchanges), (-(-count // size) * size,), args, (size,))
 
@@ -168,15 +174,17 @@ class Octahedral:
         return self._on_device[key]
 
     def orbits(self, shape: Shape, most: int = 1 << 14) -> tuple[Orbits, ...]:
-        """The outputs of a level in tiles of at most about `most`."""
+        """Return the orbits of a level in tiles of at most about `most`."""
         return orbits(shape, self.lanes * self.device.local_size, min(most, 1 << 14))
 
     def tangents(self, n: int) -> Buffer:
-        """The face coordinates of a grid's nodes."""
+        """Return the face coordinates of the nodes of an n × n grid."""
         return self._kept(("tangent", n), grid_tangents(n))
 
     def places(self, n: int) -> Buffer | None:
-        """Where the images of each class lie in an n × n grid; None where that would take more memory than the grid."""
+        """Return the places of each class's images in an n × n grid; None where they would take more memory than the
+        grid.
+        """
         if n > MOST_PLACES:
             return None
         if ("place", n) not in self._on_device:
@@ -187,7 +195,7 @@ class Octahedral:
         return self._on_device["place", n]
 
     def classes(self, n: int, grid: Buffer, exchanges: int) -> Classes:
-        """The classes of an n × n grid."""
+        """Return the classes of an n × n grid."""
         return Classes(self, n, grid, exchanges)
 
     def _series(self, lobe: Lobe, inner: Window | None, outer: Window | None, error: float) -> tuple[Any, ...]:
@@ -208,7 +216,7 @@ class Octahedral:
         )
 
     def empty(self, splits: int, found: Orbits) -> Buffer:
-        """Room for partial sums."""
+        """Return a buffer for partial sums."""
         return self.device.empty((splits, 24 * found.exchanges + 1, found.padded), self.kind)
 
     def _direction(self, found: Orbits) -> Buffer:
@@ -225,9 +233,9 @@ class Octahedral:
         classes: Classes,
         error: float,
     ) -> None:
-        """Writes the partial sums of one part of a lobe into splits first … first + splits - 1 of `partial`.
+        """Write the partial sums of one part of a lobe into splits `first` to `first + splits - 1` of `partial`.
 
-        error: the share of its energy that the lobe's series may misplace.
+        error: largest share of its energy that the lobe's series may misplace.
         """
         items = -(-found.padded // self.lanes // self.groups // self.device.local_size) * self.device.local_size
         series = self._series(lobe, part.inner, part.outer, error)
@@ -262,7 +270,7 @@ class Octahedral:
             )
 
     def apart(self, found: Orbits, lobe: Lobe, listed: Buffer) -> Buffer:
-        """Sums over a list of single sources for every output, by the NDFs themselves."""
+        """Return sums over a list of single sources for every output, by the NDFs themselves."""
         real, partial = self.kind.type, self.empty(1, found)
         for k, (entry, numbers, weight) in enumerate(lobe.summands or ((None, (), 1.0),)):
             program = self.device.build(
@@ -295,10 +303,10 @@ class Octahedral:
         per_norm: float,
         base: np.ndarray,
     ) -> None:
-        """Writes the texels of these orbits into `level`, (dims, 3 or 4) float32.
+        """Write the texels of these orbits into `level`, (dims, 3 or 4) float32.
 
-        The value is the partial sums of both kinds of parts over their weights, plus `apart` times per_norm, plus the
-        base. Without `whole` the sums are added to the level.
+        The value is the partial sums of both kinds of parts divided by their weights, plus `apart` times per_norm, plus
+        the base. Without `whole` the sums are added to the level.
         """
         real, shape = self.kind.type, found.shape
         number = self._kept(("number", shape, found.first, found.padded), found.number)
@@ -323,5 +331,5 @@ class Octahedral:
 
 @cache
 def octahedral_of(device: Device, precision: int) -> Octahedral:
-    """The shared `Octahedral` of a device and a precision."""
+    """Return the shared `Octahedral` of a device and a precision."""
     return Octahedral(device, precision)

@@ -1,5 +1,4 @@
-"""Shades spheres from an engine's own files as that engine does: a grid of roughness and metalness, or a scene's
-materials."""
+"""Shades spheres from an engine's own files as that engine does: a grid of spheres, or a scene's materials."""
 
 from __future__ import annotations
 
@@ -36,7 +35,7 @@ from whitefurnace.sphere import octahedral_map as octamap
 
 @dataclass(frozen=True)
 class Lights:
-    """The content of an engine's files of one environment, as its GPU has it: in the stored axes, with formats decoded.
+    """The content of an engine's files of one environment as its GPU has it, in the stored axes and decoded.
 
     levels      the specular chain, each (6, s, s, 3), or octahedral (s, s, 3) with `border` texels around it
     irradiance  (6, s, s, 3) E/π, None where the engine has no such cube
@@ -68,7 +67,8 @@ def shade(
     roughness: Any,
     insulator: Any = DIELECTRIC,
 ) -> np.ndarray:
-    """Radiance (m, 3) of surface points towards the viewer, lit by the environment alone, as the engine shades them.
+    """Return the radiance (m, 3) of surface points towards the viewer, lit by the environment alone, as the engine
+    shades them.
 
     n, v: unit normals and view directions (3, m) in world axes, with n·v > 0. base_color: (3,) or (m, 3) in [0, 1].
     metalness, roughness: numbers or (m,) in [0, 1]; the roughness is perceptual. insulator: F0 of the insulating part,
@@ -93,14 +93,19 @@ def shade(
 
 
 def lods(engine: Engine, roughness: np.ndarray, levels: int, width: int) -> np.ndarray:
-    """The lod in [0, levels - 1] that the engine reads for perceptual roughness values (m,). width: face edge of level
-    0."""
+    """Return the lod in [0, levels - 1] that the engine reads for perceptual roughness values (m,).
+
+    width: texels of a face edge of level 0.
+    """
     lod = engine.lod_formula(r=roughness, alpha=roughness**2, max_lod=levels - 1, width=width)
     return np.clip(np.broadcast_to(lod, np.shape(roughness)), 0, levels - 1)
 
 
 def looked_up(engine: Engine, n: np.ndarray, v: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """World directions (3, m) in which the engine reads the chain: the mirror direction, bent towards the normal."""
+    """Return the world directions (3, m) in which the engine reads the chain: the mirror direction, bent to the normal.
+
+    n, v: unit normals and view directions (3, m). roughness: perceptual roughness (m,).
+    """
     mirror = 2 * (n * v).sum(0) * n - v
     bend = engine.bend_formula(r=roughness, alpha=roughness**2)
     d = mirror + (n - mirror) * bend
@@ -108,7 +113,7 @@ def looked_up(engine: Engine, n: np.ndarray, v: np.ndarray, roughness: np.ndarra
 
 
 def stored_directions(engine: Engine, d: np.ndarray) -> np.ndarray:
-    """World directions d (3, m) in the axes of the stored cube, (3, m)."""
+    """Return world directions d (3, m) in the axes of the stored cube, (3, m)."""
     return np.asarray(engine.matrix, np.float64) @ d
 
 
@@ -121,7 +126,10 @@ def level(texels: np.ndarray, d: np.ndarray, border: int = 1) -> np.ndarray:
 
 
 def trilinear(levels: Sequence[np.ndarray], d: np.ndarray, lod: np.ndarray, border: int = 1) -> np.ndarray:
-    """A chain read in stored directions d (3, m), bilinear in two levels and linear between them: (m, 3)."""
+    """Read a chain in stored directions d (3, m), bilinearly in two levels and linearly between them: (m, 3).
+
+    lod: (m,) in [0, number of levels - 1].
+    """
     value = np.zeros((d.shape[1], 3))
     for k, texels in enumerate(levels):
         weight = np.maximum(1 - np.abs(lod - k), 0)
@@ -141,7 +149,7 @@ def specular(engine: Engine, lights: Lights, n: np.ndarray, v: np.ndarray, rough
 
 
 def irradiance(engine: Engine, lights: Lights, n: np.ndarray) -> np.ndarray:
-    """E/π (m, 3) at normals n (3, m), from the harmonics, the cube or, as in three.js, the level of r = 1."""
+    """Return E/π (m, 3) at normals n (3, m), from the harmonics, the cube or, as in three.js, the level of r = 1."""
     d = stored_directions(engine, n)
     if engine.sh is not None and lights.sh is not None:
         return np.maximum(harmonic.irradiance_at(harmonic.unscaled(lights.sh, engine.sh), d), 0)
@@ -154,8 +162,10 @@ def irradiance(engine: Engine, lights: Lights, n: np.ndarray) -> np.ndarray:
 def split_sum(
     engine: Engine, dfg: np.ndarray | None, NoV: np.ndarray, roughness: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The terms (A, B), (m,) each, of E = F0·A + B with F90 = 1, read from the engine's table in its own form; from
-    `karis` where dfg is None."""
+    """Return the terms (A, B), (m,) each, of E = F0·A + B with F90 = 1, read from the engine's table in its own form.
+
+    dfg: the table; None for the fit `karis`. NoV, roughness: (m,) in [0, 1]; the roughness is perceptual.
+    """
     if dfg is None:
         return karis(NoV, roughness)
     height, width = dfg.shape[:2]
@@ -180,7 +190,7 @@ def split_sum(
 
 
 def karis(NoV: np.ndarray, roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The terms (A, B) of the split sum by the fit of [Karis2014], for engines without a table of ours.
+    """Return the terms (A, B) of the split sum by the fit of [Karis2014], for engines without a table of ours.
 
     The fit is for the masking of Unreal Engine 4 at the time. Under height-correlated Smith masking the albedo for F0 =
     1 is up to .51 larger, on rough surfaces at grazing angles.
@@ -295,7 +305,7 @@ radiance and of E/π."""
 
 
 def read_lights(engine: Engine, folder: str | os.PathLike[str], stem: str) -> Lights:
-    """The content of an engine's files of a bake, read back from them.
+    """Read back the content of an engine's files of a bake.
 
     folder: DIR/ENGINE. stem: the files' common stem. Raises FileError and InputError for files that are missing or not
     valid, UnsupportedError for an engine that gets no prefiltered chain and for formats that are not decoded.
@@ -427,9 +437,9 @@ def _table(file: File, path: Path) -> np.ndarray:
 
 
 def engine_in(manifest: str | os.PathLike[str], name: str) -> tuple[Engine, Path, str]:
-    """(engine, its folder, stem) of a bake, from its manifest. The preset is the one that it was baked with.
+    """Return (engine, its folder, stem) of a bake, from its manifest. The preset is the one that it was baked with.
 
-    Raises InputError for a file that is no manifest of a bake, or that lists files which are missing or changed;
+    Raises InputError for a file that is not the manifest of a bake, or that lists files which are missing or changed;
     UsageError for an engine that it was not baked for.
     """
     path = Path(manifest)
@@ -463,7 +473,7 @@ def _listed(manifest: dict[str, Any]) -> dict[str, Any]:
 
 
 def dictionary(value: Any) -> dict[str, Any]:
-    """The value if it is a dictionary, else an empty one."""
+    """Return the value if it is a dictionary, otherwise an empty one."""
     return value if isinstance(value, dict) else {}
 
 
@@ -507,10 +517,10 @@ class Rendered:
 
 
 def sphere(size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The pixels of a cell of size² pixels that a sphere covers: flat indices (m,), coverage (m,) in [0, 1], and
-    normals (3, m).
+    """Return the pixels that a sphere covers in a cell of size² pixels.
 
-    The sphere is seen from +z. A pixel at the rim, whose centre may lie outside the sphere, has the normal of the rim.
+    They are flat indices (m,), coverage (m,) in [0, 1], and normals (3, m). The sphere is seen from +z. A pixel at the
+    rim, whose centre may lie outside the sphere, has the normal of the rim.
     """
     radius = RADIUS * size
     at = (np.arange(size) + 0.5 - size / 2) / radius
@@ -534,11 +544,11 @@ def grid(
     base_color: Sequence[float] = (1.0, 1.0, 1.0),
     background: str = "environment",
 ) -> np.ndarray:
-    """A picture of spheres, (rows · size, columns · size, 3) linear radiance, seen along -z.
+    """Draw a grid of spheres: (rows · size, columns · size, 3) linear radiance, seen along -z.
 
     Roughness goes from 0 to 1 from left to right, metalness from 0 to 1 from the top down (1 where there is one row).
-    size: pixels of a sphere's cell. base_color: of all spheres, in [0, 1]. background: "environment" for the image,
-    "plain" for grey. Raises UsageError for values out of range.
+    size: pixels of a sphere's cell. base_color: colour of all spheres, in [0, 1]. background: "environment" for the
+    image, "plain" for grey. Raises UsageError for values out of range.
     """
     return drawn(engine, lights, of_grid(columns, rows, base_color), size=size, background=background)
 
@@ -546,7 +556,7 @@ def grid(
 def drawn(
     engine: Engine, lights: Lights, spheres: SphereLayout, *, size: int = 128, background: str = "environment"
 ) -> np.ndarray:
-    """A picture of a layout of spheres, (rows · size, columns · size, 3) linear radiance, as `grid`.
+    """Draw a layout of spheres as `grid` does: (rows · size, columns · size, 3) linear radiance.
 
     Where the last row has fewer spheres, the rest is background. Raises UsageError for values out of range.
     """
@@ -571,7 +581,10 @@ def drawn(
 
 
 def camera(shape: tuple[int, ...], band: slice = slice(None)) -> np.ndarray:
-    """World directions (3, m) of the pixels in the rows `band` of a picture. The camera looks along -z with +y up."""
+    """Return the world directions (3, m) of the pixels in the rows `band` of a picture.
+
+    shape: (height, width, …) of the picture. The camera looks along -z with +y up.
+    """
     height, width = shape[:2]
     scale = 2 * math.tan(VIEW / 2) / height
     x = (np.arange(width) + 0.5 - width / 2) * scale
@@ -587,7 +600,7 @@ def _behind(engine: Engine, lights: Lights, shape: tuple[int, ...], band: slice)
 
 
 def srgb(linear: np.ndarray) -> np.ndarray:
-    """Linear values as sRGB in [0, 1], without a tone curve: values above 1 become 1 [IEC 61966-2-1]."""
+    """Return linear values as sRGB in [0, 1], without a tone curve: values above 1 become 1 [IEC 61966-2-1]."""
     linear = np.clip(linear, 0, 1)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
@@ -608,9 +621,10 @@ def render(
 ) -> Rendered:
     """Draw the spheres of a bake for one engine into a PNG in sRGB, as radiance times 2^exposure, clipped at 1.
 
-    manifest: of the bake. for_: the engine. size: pixels of a sphere's cell. columns, rows: of the grid; 3 rows by
-    default. base_color: of the grid, 1 1 1 by default. exposure: stops. background: "environment" or "plain". scene: a
-    glTF file whose materials are drawn in place of the grid. force: replace an existing file.
+    manifest: the manifest of the bake. for_: the engine. size: pixels of a sphere's cell. columns, rows: size of the
+    grid; 3 rows by default. base_color: colour of the grid's spheres, 1 1 1 by default. exposure: stops. background:
+    "environment" or "plain". scene: a glTF file whose materials are drawn instead of the grid. force: replace an
+    existing file.
 
     Raises UsageError for a value out of range or an engine that was not baked for, and the FileError, InputError and
     UnsupportedError of `engine_in`, `read_lights` and `read_scene`.

@@ -1,5 +1,4 @@
-"""Draws an engine's picture of spheres, the full reflectance integral of the same pixels, and their difference side by
-side."""
+"""Draws an engine's picture of spheres, the full reflectance integral of the same pixels, and their difference."""
 
 from __future__ import annotations
 
@@ -78,8 +77,10 @@ class Material:
     multiscatter: bool = False
 
     def terms(self, roughness: float) -> dict[str, Term]:
-        """The terms of the specular part at a roughness: "both" for Schlick's, linear in F0, or "dielectric" and
-        "metal"."""
+        """Return the terms of the specular part at a perceptual roughness.
+
+        Schlick's is "both", which is linear in F0; `dielectric` and `metal` are terms of their own.
+        """
         base: dict[str, Any] = {"ndf": self.ndf, "masking": self.masking, "roughness": roughness}
         found = {}
         if self.dielectric is None or self.metal is None:
@@ -106,10 +107,11 @@ class Certified:
 class Shown:
     """The pictures of an engine, of the truth and of their difference.
 
-    engine, truth, difference  (h, w, 3), linear; the difference is (engine - truth) over the luminance of the
-                               truth, and 0 outside the spheres
-    samples, estimates         samples a pixel and the estimated error of the truth, for each value of `roughness`
-    certificate                pixels compared with the quadrature
+    engine, truth, difference  (h, w, 3), linear; the difference is (engine - truth) over the luminance of the truth,
+                               and 0 outside the spheres
+    samples, estimates         samples for each pixel and the estimated error of the truth, for each value of
+                               `roughness`
+    certificate                pixels that were compared with the quadrature
     seconds                    wall time by activity
     covered                    (h, w) bool, pixels that a sphere covers
     roughness                  of each column of a grid, or the distinct ones of a scene
@@ -131,7 +133,7 @@ class Shown:
         return np.asarray(self.difference @ LUMINANCE)
 
     def within(self, share: float) -> float:
-        """The largest relative difference among the best `share` of the spheres' pixels."""
+        """Return the relative difference that the share `share` of the spheres' pixels does not exceed."""
         return float(np.quantile(np.abs(self.luminance[self.covered]), share))
 
     @property
@@ -175,10 +177,11 @@ class Spheres:
         spheres: Sequence[MaterialSphere],
         tolerance: float,
     ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
-        """The truth of spheres of one roughness.
+        """Compute the true radiance of spheres of one roughness.
 
-        Returns ((m, 3) by the environment for each sphere, (m, 3) by the further lights for each, samples a point,
-        their estimated error, terms). tolerance: of the 99th percentile of the specular part's errors.
+        Returns the radiance (m, 3) by the environment for each sphere, that by the further lights for each, the samples
+        of a point, their estimated error, and the terms. tolerance: of the 99th percentile of the specular part's
+        errors.
         """
         truth, points = self.truth, self.points
         found = self.material.terms(roughness)
@@ -230,7 +233,7 @@ class Spheres:
         return bilinear(cube, self.points.n)
 
     def diffuse(self, base_color: Triple) -> np.ndarray:
-        """Reflection (m, 3) of the environment by the diffuse model, base colour included."""
+        """Return the reflection (m, 3) of the environment by the diffuse model, with the base colour."""
         truth, points = self.truth, self.points
         if self.material.diffuse is None:
             return np.asarray(self._lambert * np.asarray(base_color, np.float64))
@@ -249,7 +252,7 @@ class Spheres:
         return Term(found.models, {name: np.broadcast_to(v, (3,)) for name, v in found.parameters.items()})
 
     def diffuse_lit(self, base_color: Triple) -> np.ndarray:
-        """Reflection (m, 3) of the further lights by the diffuse model, base colour included."""
+        """Return the reflection (m, 3) of the further lights by the diffuse model, with the base colour."""
         if not self.lights:
             return np.zeros((self.points.n.shape[1], 3))
         if base_color not in self._diffuse_lit:
@@ -258,7 +261,9 @@ class Spheres:
         return self._diffuse_lit[base_color]
 
     def lit(self, found: Term) -> np.ndarray:
-        """Reflection (m, S, 3) of the further lights under a term, in closed form or along their outlines."""
+        """Return the reflection (m, S, 3) of the further lights under a term, in closed form or along their
+        outlines.
+        """
         points, total = self.points, np.zeros((self.points.n.shape[1], found.sets, 3))
         own = {name: np.broadcast_to(v, (found.sets,)) for name, v in found.parameters.items()}
         models: dict[str, Any] = dict(found.models)
@@ -294,7 +299,7 @@ def _facing() -> Points:
 
 
 def in_frame(light: Chosen, given: Mapping[str, float], points: Points) -> dict[str, np.ndarray]:
-    """A light's parameters, (m,) each, in the frame of every point, where n is +z and v has the azimuth 0.
+    """Return a light's parameters, (m,) each, in the frame of every point, where n is +z and v has the azimuth 0.
 
     given: parameters in the frame of the sphere's middle, a surface that faces the viewer: +z towards the viewer, +x to
     the right, lengths in radii. NAME_x, NAME_y, NAME_z are a vector, and `center` is a place; NoL and phi_l are a
@@ -325,9 +330,10 @@ def in_frame(light: Chosen, given: Mapping[str, float], points: Points) -> dict[
 
 
 def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], device: Device) -> Environment:
-    """The environment of a bake, turned, exposed and without its sun as its manifest says.
+    """Return the environment of a bake: rotated, exposed and without its sun as its manifest says.
 
-    Raises InputError where the image's digest is not the one in the manifest, and the errors of `environment`.
+    given: the image that the bake was made from. Raises InputError where the image's digest is not the one in the
+    manifest, and the errors of `environment`.
     """
     written = shading.dictionary(read_manifest(Path(manifest)))
     recipe, source = shading.dictionary(written.get("recipe")), shading.dictionary(written.get("source"))
@@ -351,7 +357,7 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
 
 
 def ndf_of(manifest: str | os.PathLike[str]) -> Spec:
-    """The NDF with which a bake was filtered. Raises UsageError for one from a file."""
+    """Return the NDF with which a bake was filtered. Raises UsageError for an NDF from a file."""
     ndf = shading.dictionary(shading.dictionary(read_manifest(Path(manifest))).get("recipe")).get("ndf", "ggx")
     if isinstance(ndf, str):
         return ndf
@@ -377,12 +383,12 @@ def panels(
     further: Sequence[Spec] = (),
     progress: Callable[[str, float], None] | None = None,
 ) -> Shown:
-    """The spheres of `shading.drawn` as the engine shows them, in truth, and their difference.
+    """Draw the spheres of `shading.drawn` as the engine shows them, as they truly look, and the difference.
 
-    material: the reflection model of the truth; roughness below MIRROR is a mirror in it. tolerance: of the 99th
-    percentile of errors of the specular part of each roughness, over its value or 1e-3 of the mean radiance. certify:
-    pixels of each roughness that are compared with the quadrature. further: lights that are added to both pictures
-    alike. Raises the errors of `shading.drawn`.
+    material: the reflection model of the truth; a roughness below MIRROR is a mirror in it. tolerance: of the 99th
+    percentile of errors of the specular part of each roughness, relative to its value or 1e-3 of the mean radiance.
+    certify: number of pixels of each roughness that are compared with the quadrature. further: lights that are added to
+    both pictures. Raises the errors of `shading.drawn`.
     """
     begin = time.perf_counter()
     shown = shading.drawn(engine, lights, layout, size=size, background=background)
@@ -465,8 +471,10 @@ def _certificate(
 
 
 def scale_of(shown: Shown) -> float:
-    """The difference at the ends of the colour scale: 1, 2 or 5 times a power of ten, at most 1, that 95 % of the
-    spheres' pixels are within."""
+    """Return the difference at the ends of the colour scale: 1, 2 or 5 times a power of ten, at most 1.
+
+    95 % of the spheres' pixels are within it.
+    """
     most = shown.within(MOST)
     power = 10.0 ** math.floor(math.log10(max(most, 1e-6)))
     return min(next(k * power for k in (1, 2, 5, 10) if k * power >= most * (1 - 1e-9)), 1.0)
@@ -497,10 +505,10 @@ def render(
     force: bool = False,
     progress: Callable[[str, float], None] | None = None,
 ) -> Rendered:
-    """Draw the spheres of a bake for one engine, the truth and their difference side by side.
+    """Draw the spheres of a bake for one engine, their true look and the difference side by side.
 
     A PNG gets three panels with a scale. An EXR gets the layers engine, truth and difference in float32, without
-    exposure. truth: the image that the bake was made of. The other parameters are those of `shading.render`, `panels`
+    exposure. truth: the image that the bake was made from. The other parameters are those of `shading.render`, `panels`
     and `Material`; the NDF is the bake's own by default.
 
     Raises their errors, and UnsupportedError for a PNG without matplotlib.

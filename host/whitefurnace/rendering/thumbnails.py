@@ -41,7 +41,7 @@ Matrix = tuple[tuple[int, int, int], ...]
 
 
 def tone(linear: np.ndarray, exposure: float) -> np.ndarray:
-    """Radiance times `exposure` as sRGB in [0, 1], through the filmic curve of [Narkowicz2015].
+    """Return radiance times `exposure` as sRGB in [0, 1], through the filmic curve of [Narkowicz2015].
 
     The curve is x(2.51x + .03) / (x(2.43x + .59) + .14). It reaches 1 at x = 7.2 and is cut there.
     """
@@ -50,7 +50,7 @@ def tone(linear: np.ndarray, exposure: float) -> np.ndarray:
 
 
 def exposure_of(texels: np.ndarray) -> float:
-    """Factor that brings the middle of a level (6, s, s, 3) to a grey of .18.
+    """Return the factor that brings the middle of a level (6, s, s, 3) to a grey of .18.
 
     The middle is the log-average of luminance over the sphere [Reinhard2002, eq. 1], or a quarter of the mean where
     that is more. So rough levels, whose values are near the mean, are not burnt out by a lamp in a dark room or a sun.
@@ -65,11 +65,11 @@ def exposure_of(texels: np.ndarray) -> float:
 
 
 def thumbnail(levels: Sequence[np.ndarray], matte: np.ndarray, matrix: Matrix = WORLD) -> np.ndarray:
-    """A picture (CELL, width, 4) uint8 in sRGB: the first level as a panorama, each level on a metal sphere, and a
-    matte sphere.
+    """Draw a picture (CELL, width, 4) uint8 in sRGB: a panorama, a metal sphere for each level, and a matte sphere.
 
-    levels: cubes (6, s, s, 3). The panorama has +X in its middle; the spheres are seen along -z and mirror the level.
-    matte: irradiance (m, 3) at `normals()`. matrix: maps world directions to those of the cubes.
+    levels: cubes (6, s, s, 3). The panorama shows the first level with +X in its middle; the spheres are seen along -z
+    and mirror their level. matte: irradiance (m, 3) at `normals()`. matrix: maps world directions to those of the
+    cubes.
     """
     cubes = [_reduced(texels) for texels in levels[:MOST_SPHERES]]
     exposure = exposure_of(cubes[0])
@@ -88,7 +88,7 @@ def thumbnail(levels: Sequence[np.ndarray], matte: np.ndarray, matrix: Matrix = 
 
 
 def normals() -> np.ndarray:
-    """Normals (3, m) of the pixels of a sphere, drawn with twice as many pixels a side as are kept."""
+    """Return the normals (3, m) of the pixels of a sphere, drawn with twice as many pixels on a side as are kept."""
     return sphere(FINE)[2]
 
 
@@ -98,10 +98,11 @@ def write_thumbnail(path: str | os.PathLike[str], texels: tuple[Sequence[np.ndar
 
 
 def read_thumbnail(manifest: Path, stated: Mapping[str, Any]) -> tuple[Sequence[np.ndarray], np.ndarray, Matrix]:
-    """(levels, irradiance, axes) of a bake, from the files of the first of its engines that has a chain, `raw` first.
+    """Read (levels, irradiance, axes) of a bake, from the files of the first of its engines that has a chain, `raw`
+    first.
 
-    Where no engine has one, they come from an image. stated: the content of the manifest. Raises FileError and
-    InputError for files that are missing, changed or not valid, UnsupportedError where none can be decoded.
+    If no engine has one, they come from an image. stated: the content of the manifest. Raises FileError and InputError
+    for files that are missing, changed or not valid, and UnsupportedError where none can be decoded.
     """
     recipe = stated.get("recipe")
     names = recipe.get("for") if isinstance(recipe, Mapping) else None

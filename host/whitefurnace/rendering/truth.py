@@ -1,9 +1,9 @@
-"""Computes the full reflectance integral of surface points in an environment [Hoffman2012, "The Reflectance Equation"],
-by importance sampling on the device.
+"""Computes the full reflectance integral of surface points in an environment, by importance sampling on the device.
 
-An engine shows the split sum: its levels have n = v = r, and its table knows no light. Here nothing is split: L_o(v) =
-∫ L(l) f(l, v)(n·l) dω, with every facet's own view, Fresnel and masking inside. `radiance.py` computes the same for a
-few cells by quadrature in float64; a picture's error is stated against it.
+[Hoffman2012, "The Reflectance Equation"] An engine shows the split sum: its levels have n = v = r, and its table knows
+no light. Here nothing is split: L_o(v) = ∫ L(l) f(l, v)(n·l) dω, with every facet's own view, Fresnel and masking
+inside. `radiance.py` computes the same for a few cells by quadrature in float64; a picture's error is measured against
+it.
 """
 
 from __future__ import annotations
@@ -81,8 +81,10 @@ class Points:
         return np.clip((self.n * self.v).sum(0), 1e-6, 1.0)
 
     def surface(self) -> np.ndarray:
-        """n, the direction of v's projection, n·v and √(1 - (n·v)²), (8, m). Where v is n, the direction is any
-        tangent."""
+        """n, the direction of v's projection, n·v and √(1 - (n·v)²), (8, m).
+
+        Where v equals n, the direction is any tangent.
+        """
         n, v, NoV = self.n, self.v, self.NoV
         across = v - NoV * n
         length = np.sqrt((across * across).sum(0))
@@ -92,7 +94,7 @@ class Points:
         return np.concatenate([n, across, NoV[None], np.sqrt((1 - NoV) * (1 + NoV))[None]])
 
     def some(self, index: Any) -> Points:
-        """The points of an index."""
+        """Return the points with the indices `index`."""
         return Points(self.n[:, index], self.v[:, index])
 
 
@@ -101,7 +103,7 @@ class Term:
     """A summand of the BRDF, in S variants that share their samples.
 
     models      models by slot
-    parameters  (S,) each, by SLOT_NAME
+    parameters  (S,) values by SLOT_NAME
     smooth      True for a mirror, roughness 0
     """
 
@@ -115,7 +117,7 @@ class Term:
         return max((len(v) for v in self.parameters.values()), default=1)
 
     def width(self, device: Device) -> float:
-        """Width of the lobe of the term's normals, 1 for a diffuse model."""
+        """Return the width of the lobe of the term's normals; 1 for a diffuse model."""
         if "ndf" not in self.models:
             return 1.0
         entry = self.models["ndf"].model
@@ -133,9 +135,10 @@ def term(
     diffuse: Spec | None = None,
     **parameters: Any,
 ) -> Term:
-    """A term from specs, an NDF's perceptual roughness and further parameters; a preset's RGB become three variants.
+    """Make a term from models and parameters. An RGB value of a preset becomes three variants.
 
-    Raises UsageError, and UnsupportedError for an anisotropic NDF.
+    roughness: perceptual roughness of the NDF in [0, 1]. parameters: further parameters by SLOT_NAME. Raises
+    UsageError, and UnsupportedError for an anisotropic NDF.
     """
     slots = slots_of(integral("albedo"), ndf, masking, fresnel, diffuse, None)
     given: dict[str, Any] = {}
@@ -160,7 +163,10 @@ def term(
 
 
 def albedo(found: Term, NoV: np.ndarray, device: Device) -> np.ndarray:
-    """Directional albedo ∫ f (n·l) dω of a term by quadrature, (m, S)."""
+    """Return the directional albedo ∫ f (n·l) dω of a term by quadrature, (m, S).
+
+    NoV: cosines of the views, (m,) in [0, 1].
+    """
     distinct, which = np.unique(NoV, return_inverse=True)
     given: dict[str, Any] = {name: np.broadcast_to(v, (found.sets,)) for name, v in found.parameters.items()}
     models: dict[str, Any] = dict(found.models)
@@ -169,7 +175,7 @@ def albedo(found: Term, NoV: np.ndarray, device: Device) -> np.ndarray:
 
 
 def blocks(env: Environment, excess: np.ndarray, angle: float) -> np.ndarray:
-    """The excess of bright texels as lights (k, 6): unit directions and Ω L.
+    """Return the excess of bright texels as lights (k, 6): unit directions and Ω L.
 
     excess: (h, w, 3) or (6, n, n, 3). A light is one texel or, where texels are smaller than `angle` radians, a square
     of about that size, in the direction of its middle, weighted by the mean of the channels.
@@ -191,7 +197,7 @@ def blocks(env: Environment, excess: np.ndarray, angle: float) -> np.ndarray:
 
 
 def cut(env: Environment, excess: np.ndarray, cuts: int) -> np.ndarray:
-    """The excess of bright texels as lights (k, 6), as `blocks`, with each texel cut into cuts² parts."""
+    """Return the excess of bright texels as lights (k, 6), as `blocks` does, with each texel cut into cuts² parts."""
     flat = excess.reshape(-1, 3)
     index = np.flatnonzero(flat.any(1))
     rows, columns = env.texels.shape[-3:-1]
@@ -215,15 +221,15 @@ def cut(env: Environment, excess: np.ndarray, cuts: int) -> np.ndarray:
 
 
 def texel_of(env: Environment) -> float:
-    """Angle of a texel in radians; for a cube, of one in the middle of a face."""
+    """Return the angle of a texel in radians; for a cube that of one in the middle of a face."""
     return math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
 
 
 class Truth:
-    """Reflected radiance in one environment, in the units of its texels.
+    """Computes reflected radiance in one environment, in the units of its texels.
 
     Sums are over the radiance above the smallest value of each channel, and are divided by the sum of their own
-    weights. The albedo, by quadrature, replaces that sum, so that constant light comes out exactly.
+    weights. The albedo, by quadrature, replaces that sum, so that constant light gives exactly that constant.
     """
 
     def __init__(self, device: Device, env: Environment, precision: int = 32) -> None:
@@ -252,7 +258,9 @@ class Truth:
         return self._whole
 
     def lights(self, found: Term) -> np.ndarray | None:
-        """The lights (k, 6) that are summed apart for a term; None where its lobe is too narrow to cut texels for."""
+        """Return the lights (k, 6) that are summed apart for a term; None where its lobe is too narrow to cut texels
+        for.
+        """
         width, count = found.width(self.device), int(self.excess.any(-1).sum())
         cuts = math.ceil(texel_of(self.env) / (NEAR * width))
         if count * cuts**2 > MOST_CUT and cuts > 1:
@@ -270,9 +278,9 @@ class Truth:
         count: int,
         progress: Callable[[float], None] | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """(radiance (m, S, 3), albedo (m, S)) of points under a term.
+        """Compute radiance (m, S, 3) and albedo (m, S) of points under a term.
 
-        count: samples of each point. progress: called with the share of points that is done.
+        count: number of samples of each point. progress: called with the share of the points that is done.
         """
         if found.smooth:
             return self.mirror(found, points)
@@ -296,11 +304,10 @@ class Truth:
         return F[..., None].astype(np.float64) * L[:, None], F.astype(np.float64)
 
     def samples(self, found: Term, points: Points, tolerance: float) -> tuple[int, float]:
-        """(samples, error) at which the 99th percentile of the errors of all variants is within a tolerance, at some of
-        the points.
+        """Return the number of samples with which a term meets a tolerance, and the error of that many samples.
 
-        The errors are measured against four times as many samples. Where the tolerance is never met, the number is
-        MOST_SAMPLES.
+        The error is the 99th percentile over all variants at some of the points, measured against four times as many
+        samples. Where the tolerance is never met, the number is MOST_SAMPLES.
         """
         m = points.n.shape[1]
         some = points.some(np.unique(np.linspace(0, m - 1, min(TRIED, m)).astype(int)))
@@ -315,8 +322,9 @@ class Truth:
             count, before = 4 * count, after
 
     def exact(self, found: Term, variant: int, points: Points, k: int) -> np.ndarray:
-        """Reflected radiance (3,) of one variant at point k, by quadrature in float64 over the environment's own
-        texels."""
+        """Return the reflected radiance (3,) of one variant at point k, by quadrature in float64 over the
+        environment's texels.
+        """
         frame = frame_of(points.n[:, k].tolist())
         x, y, z = frame @ points.v[:, k]
         given: dict[str, Any] = {
@@ -342,7 +350,7 @@ class Truth:
     def sums(
         self, found: Term, points: Points, count: int, sampler: Sampler, progress: Callable[[float], None] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Means over `count` samples of weight × (L - base), (m, S, 3), and of the weights, (m, S)."""
+        """Return the means over `count` samples of weight × (L - base), (m, S, 3), and of the weights, (m, S)."""
         device, size, width = self.device, sampler.size, found.width(self.device)
         while size < LARGEST_SOURCE and math.pi / 2 / size > SHARPER * width:
             size *= 2
@@ -356,7 +364,7 @@ class Truth:
     def gathered(
         self, found: Term, points: Points, lights: np.ndarray, progress: Callable[[float], None] | None = None
     ) -> np.ndarray:
-        """∑ Ω L f (n·l) over lights (k, 6), unit directions and Ω L: (m, S, 3)."""
+        """Return ∑ Ω L f (n·l) over lights (k, 6), which are unit directions and Ω L: (m, S, 3)."""
         if not len(lights):
             return np.zeros((points.n.shape[1], found.sets, 3))
         table = np.zeros((len(lights), 8))

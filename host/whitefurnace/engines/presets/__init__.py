@@ -48,7 +48,7 @@ ENGINES = {name: msgspec.structs.replace(preset.engine, name=name) for name, pre
 
 
 def engines(names: str) -> tuple[Engine, ...]:
-    """The engines of a list of names and `.toml` files, separated by commas, each once.
+    """Return the engines of a list of names and `.toml` files, separated by commas; each appears once.
 
     Raises UsageError with the nearest name, and FileError or InputError for a file.
     """
@@ -66,7 +66,7 @@ def engines(names: str) -> tuple[Engine, ...]:
 
 
 def as_text(engine: Engine) -> str:
-    """The TOML of an engine that `user_engine` reads: the fields that differ from the defaults."""
+    """Return an engine as TOML that `user_engine` reads: the fields that differ from their defaults."""
 
     def value(x: Any) -> str:
         if isinstance(x, bool):
@@ -102,8 +102,8 @@ MOST_BYTES = 1 << 20
 def user_engine(path: str | os.PathLike[str]) -> Engine:
     """Read the description of an engine from a TOML file.
 
-    path: has the fields of `Engine`, `[dfg]` and `[[file]]`. The engine's name is the file's stem.
-    Raises FileError for a file that cannot be read, InputError for one that does not describe an engine.
+    path: a file with the fields of `Engine`, `[dfg]` and `[[file]]`. The engine's name is the file's stem.
+    Raises FileError for a file that cannot be read, and InputError for one that does not describe an engine.
     """
     path = Path(path)
     try:
@@ -139,9 +139,9 @@ def user_engine(path: str | os.PathLike[str]) -> Engine:
 
 
 def engine_of_data(data: Any, where: str) -> Engine:
-    """The engine of what `Engine.data` gave, as a manifest keeps it.
+    """Return the engine that `Engine.data` described, as a manifest keeps it.
 
-    where: the manifest, for errors. Raises InputError for data that describes no engine.
+    where: the manifest, for error messages. Raises InputError for data that do not describe an engine.
     """
     try:
         engine = msgspec.convert(data, Engine)
