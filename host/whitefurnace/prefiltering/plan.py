@@ -254,8 +254,7 @@ TILE_REACH = 4.0
 
 
 def close_work(chord: float, n: int) -> float:
-    """Return the cost of summing the nodes within a chord without transforms, relative to a transformed sum over all
-    nodes.
+    """Return the cost of summing the nodes within a chord directly, relative to a transformed sum over all nodes.
 
     A node costs eight times as much, and chord²/4 of the sphere is summed. n: nodes of an edge of the grid.
     """

@@ -67,8 +67,7 @@ def shade(
     roughness: Any,
     insulator: Any = DIELECTRIC,
 ) -> np.ndarray:
-    """Return the radiance (m, 3) of surface points towards the viewer, lit by the environment alone, as the engine
-    shades them.
+    """Return radiance (m, 3) of surface points towards the viewer, as the engine shades them by the environment alone.
 
     n, v: unit normals and view directions (3, m) in world axes, with n·v > 0. base_color: (3,) or (m, 3) in [0, 1].
     metalness, roughness: numbers or (m,) in [0, 1]; the roughness is perceptual. insulator: F0 of the insulating part,

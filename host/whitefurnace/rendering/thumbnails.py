@@ -98,11 +98,11 @@ def write_thumbnail(path: str | os.PathLike[str], texels: tuple[Sequence[np.ndar
 
 
 def read_thumbnail(manifest: Path, stated: Mapping[str, Any]) -> tuple[Sequence[np.ndarray], np.ndarray, Matrix]:
-    """Read (levels, irradiance, axes) of a bake, from the files of the first of its engines that has a chain, `raw`
-    first.
+    """Read the data of a thumbnail: (levels, irradiance, axes) from the files of the first engine that has a chain.
 
-    If no engine has one, they come from an image. stated: the content of the manifest. Raises FileError and InputError
-    for files that are missing, changed or not valid, and UnsupportedError where none can be decoded.
+    `raw` comes first. If no engine has a chain, they come from an image. stated: the content of the manifest. Raises
+    FileError and InputError for files that are missing, changed or not valid, and UnsupportedError where none can be
+    decoded.
     """
     recipe = stated.get("recipe")
     names = recipe.get("for") if isinstance(recipe, Mapping) else None

@@ -79,7 +79,7 @@ class SphereLayout:
 
 
 def steps(count: int, alone: float) -> tuple[float, ...]:
-    """`count` values from 0 to 1 in equal steps; (alone,) for one value."""
+    """Return `count` values from 0 to 1 in equal steps, or `alone` where `count` is 1."""
     return tuple(float(x) for x in np.linspace(0, 1, count)) if count > 1 else (alone,)
 
 
@@ -90,9 +90,10 @@ def in_range(what: str, value: int, limits: tuple[int, int] = COUNT_RANGE) -> No
 
 
 def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0, 1.0, 1.0)) -> SphereLayout:
-    """A grid of spheres: roughness from 0 to 1 from left to right, metalness from 0 to 1 from the top down.
+    """Return a grid of spheres: roughness 0 to 1 from left to right, metalness 0 to 1 from the top down.
 
-    With one column the roughness is 0; with one row the metalness is 1. Raises UsageError for values out of range.
+    columns, rows: numbers of spheres. With one column the roughness is 0; with one row the metalness is 1. Raises
+    UsageError for values out of range.
     """
     in_range("columns", columns)
     in_range("rows", rows)
@@ -105,9 +106,9 @@ def of_grid(columns: int = 7, rows: int = 3, base_color: Sequence[float] = (1.0,
 
 
 def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
-    """A sphere for each lit material of a scene, in the order of the file, at most MOST of them.
+    """Return a sphere for each lit material of a scene, in the order of the file, at most MOST of them.
 
-    Raises UsageError for columns out of range, InputError for a scene in which every material is unlit.
+    Raises UsageError for columns out of range, and InputError for a scene in which every material is unlit.
     """
     in_range("columns", columns)
     lit = [m for m in scene.materials if not m.unlit]
@@ -141,7 +142,7 @@ def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
 def layout_of(
     scene: str | os.PathLike[str] | None, columns: int, rows: int | None, base_color: Sequence[float] | None
 ) -> SphereLayout:
-    """The spheres of a scene's materials, or of a grid where no scene is given.
+    """Return the spheres of a scene's materials, or of a grid where no scene is given.
 
     Raises UsageError for rows or a base colour together with a scene, and the errors of `of_grid`, `of_scene` and
     `read_scene`.
@@ -157,12 +158,14 @@ def layout_of(
 
 
 def middle(spread: Spread) -> np.ndarray:
-    """Mean of a property over the texels in use, (channels,); the middle of its range where the mean is not known."""
+    """Return the mean of a property over the texels in use, (channels,); the middle of its range where no mean is
+    known.
+    """
     return np.array(spread.mean) if spread.mean else (np.array(spread.low) + np.array(spread.high)) / 2
 
 
 def insulator(m: Material) -> Triple:
-    """F0 of the insulating part by KHR_materials_ior and KHR_materials_specular: min(((n - 1)/(n + 1))² c, 1) w.
+    """Return F0 of the insulating part by KHR_materials_ior and KHR_materials_specular: min(((n - 1)/(n + 1))² c, 1) w.
 
     An ior of 0 stands for infinity. Without either extension it is the engines' .04.
     """

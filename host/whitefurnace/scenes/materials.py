@@ -1,5 +1,7 @@
-"""Reads a glTF scene: its materials, with the range of each value through factors and textures, its size and its
-cameras. `needs` decides what follows from them."""
+"""Reads a glTF scene: its size, its cameras, and its materials with the range of each value.
+
+The ranges go through factors and textures. `advice.needs` decides what follows from them.
+"""
 
 from __future__ import annotations
 
@@ -37,9 +39,9 @@ ROUNDING = 1e-4
 class Property:
     """A value that a material has.
 
-    extension  that defines it, "" for glTF's core
+    extension  name of the extension that defines it, "" for glTF's core
     factor     name of its factor; `default`: the factor's default
-    texture    name of its texture; `channels`: those that multiply the factor; `srgb`: their transfer function
+    texture    name of its texture; `channels`: those that multiply the factor; `srgb`: True if they are coded in sRGB
     low, high  range of the factor
     """
 
@@ -147,7 +149,9 @@ class Spread:
 
     @property
     def shares(self) -> tuple[tuple[float, float, float], ...]:
-        """(low, high, share) of each part of the range in use, cut to its ends; for a property of one channel."""
+        """Return (low, high, share) of each part of the range in use, cut to its ends; for a property of one
+        channel.
+        """
         if not self.histogram:
             return ((self.least, self.most, 1.0),)
         return tuple(
@@ -177,7 +181,7 @@ class Material:
         return self.values[name]
 
     def has(self, extension: str) -> bool:
-        """True if it has KHR_materials_`extension`."""
+        """Return whether the material has KHR_materials_`extension`."""
         return _KHR + extension in self.given
 
 
@@ -234,7 +238,7 @@ def read_scene(path: str | os.PathLike[str]) -> Scene:
 
 
 def library() -> Any:
-    """The module pygltflib. Raises UnsupportedError where it is not installed."""
+    """Return the module pygltflib. Raises UnsupportedError where it is not installed."""
     try:
         import pygltflib
     except ImportError:

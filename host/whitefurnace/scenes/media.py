@@ -1,5 +1,7 @@
-"""Judges the media inside a scene's materials: the size that light crosses, the length that a pixel covers, and the
-table of pre-integrated diffusion that is needed where local diffuse is wrong."""
+"""Judges the media inside a scene's materials: the size that light crosses and the length that a pixel covers.
+
+Where local diffuse reflection is wrong, it names the table of pre-integrated diffusion that is needed.
+"""
 
 from __future__ import annotations
 
@@ -40,9 +42,9 @@ class Inside:
     """The medium inside a material.
 
     material   its name, "" for the scene as a whole
-    judgement  None for a material without an inside, for the given `reason`
-    size_of    says which size light crosses
-    table      options of `lut` with a file's name as `output`; None where no table is needed, or where none can be made
+    judgement  the judgement; None for a material without an inside, for the given `reason`
+    size_of    names the size that light crosses
+    table      options of `lut` with a file name as `output`; None where no table is needed, or where none can be made
                for the given `reason`
     """
 
@@ -60,7 +62,7 @@ class Inside:
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Sentences about the medium; the last is the command of its table, if it needs one."""
+        """Return sentences about the medium; the last is the command for its table, if it needs one."""
         said = [*(self.judgement.sentences if self.judgement else ()), *([self.reason] if self.reason else [])]
         if self.table is not None:
             numbers = "".join(f" --set {one}" for one in self.table.get("set", ()))
@@ -80,7 +82,7 @@ class Pixel:
 
     @property
     def text(self) -> str:
-        """A phrase that states the length."""
+        """Return a phrase that states the length."""
         return f"a pixel is {length_text(self.metres)}" + (f", as {self.of} sees the nearest of it" if self.of else "")
 
 
@@ -88,11 +90,11 @@ class Pixel:
 
 
 def named_media(texts: Sequence[str], scene: Scene) -> dict[str, Medium]:
-    """The media of texts `[MATERIAL:]MEDIUM`, by material; "" is the scene as a whole.
+    """Return the media of texts `[MATERIAL:]MEDIUM`, by material; "" is the scene as a whole.
 
-    MEDIUM is a name of scale.MEDIA, or numbers per mm as `σa=.03/.17/.48,σs=.74/.88/1.01,g=0,ior=1.3`, one or three of
-    each. `distance=0.1m,color=.9/.5/.1`, as in KHR_materials_volume, replaces σa. Without an ior the material's is
-    used. Raises UsageError.
+    MEDIUM is a name of scale.MEDIA, or numbers per mm such as `σa=.03/.17/.48,σs=.74/.88/1.01,g=0,ior=1.3`, one or
+    three of each. `distance=0.1m,color=.9/.5/.1`, as in KHR_materials_volume, replaces σa. Without an ior the
+    material's is used. Raises UsageError.
     """
     found: dict[str, Medium] = {}
     names = [m.name for m in scene.materials]
@@ -158,9 +160,10 @@ def _per_metre(values: Triple) -> Triple:
 
 
 def pixel_of(scene: Scene, text: str | None = None, rows: int | None = None) -> Pixel | None:
-    """The length that a pixel covers, None where neither `text` nor `rows` is given.
+    """Return the length that a pixel covers; None where neither `text` nor `rows` is given.
 
-    text: a length as `0.5mm`. rows: height of an image of the camera that shows the scene largest. Raises UsageError.
+    text: a length such as `0.5mm`. rows: height in pixels of an image by the camera that shows the scene largest.
+    Raises UsageError.
     """
     if text is not None and rows is not None:
         raise UsageError("give --pixel or --resolution, not both")
@@ -197,8 +200,10 @@ def _distance(scene: Scene, position: np.ndarray) -> float:
 
 
 def inside(scene: Scene, pixel: Pixel | None, media: dict[str, Medium]) -> tuple[Inside, ...]:
-    """What each medium needs, of `media` and of the KHR_materials_volume in materials without one there. Raises
-    UsageError."""
+    """Judge the medium inside each material, from `media` or from the material's KHR_materials_volume.
+
+    pixel: length that a pixel covers, or None. Raises UsageError.
+    """
     found = []
     for m in scene.materials:
         if m.name in media or m.has("volume"):

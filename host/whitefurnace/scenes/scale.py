@@ -1,6 +1,7 @@
-"""Judges the media of a scene at its scale: whether absorption is visible over an object's size, and whether light
-leaves farther than a pixel from where it entered. Diffuse light is subsurface scattering seen from far enough
-[Hoffman2012].
+"""Judges the media of a scene at its scale.
+
+It decides whether absorption is visible over an object's size, and whether light leaves farther than a pixel from where
+it entered. Diffuse light is subsurface scattering seen from far enough [Hoffman2012].
 
 Lengths are in metres and coefficients per metre; three numbers are RGB.
 """
@@ -59,7 +60,7 @@ _XYZ = np.array(
 
 
 def length(text: str) -> float:
-    """Metres of a length with its unit, as `0.5mm`. Raises UsageError."""
+    """Return a length such as `0.5mm` in metres. Raises UsageError."""
     match = re.fullmatch(r"\s*([0-9.]+(?:[eE][+-]?[0-9]+)?)\s*([^\s0-9]*)\s*", text)
     try:
         value = float(match[1]) if match else math.nan
@@ -75,10 +76,10 @@ def length(text: str) -> float:
 def footprint(
     height: int, *, yfov: float | None = None, distance: float | None = None, ymag: float | None = None
 ) -> float:
-    """Metres that a pixel of an image covers, for a camera as glTF has them.
+    """Return the length in metres that a pixel of an image covers, for a camera as glTF describes it.
 
-    height: of the image in pixels. yfov, distance: vertical angle in radians of a perspective camera, and metres to the
-    object. ymag: half the height in metres that an orthographic camera shows. Raises UsageError.
+    height: height of the image in pixels. yfov, distance: vertical angle in radians of a perspective camera, and metres
+    to the object. ymag: half the height in metres that an orthographic camera shows. Raises UsageError.
     """
     if height < 1:
         raise UsageError(f"an image of {height} rows has no pixel")
@@ -101,7 +102,7 @@ def _positive(name: str, value: float) -> float:
 
 
 def length_text(metres: float) -> str:
-    """A length as people write it: 0.5 mm, 3.4 m."""
+    """Return a length in metres as text for users, such as 0.5 mm or 3.4 m."""
     if math.isinf(metres):
         return "any distance"
     for unit in ("km", "m", "mm", "µm"):
@@ -158,10 +159,10 @@ class Medium:
         ior: float = 1.5,
         name: str = "",
     ) -> Medium:
-        """The medium of glTF's KHR_materials_volume, σa = -ln(colour)/distance.
+        """Return the medium of glTF's KHR_materials_volume, σa = -ln(colour)/distance.
 
         attenuation_distance: metres after which white light has the colour `attenuation_color`; None or infinity for no
-        absorption. The extension has no scattering. Raises UsageError.
+        absorption. scattering, g, ior, name: fields of the medium; the extension has no scattering. Raises UsageError.
         """
         if attenuation_distance is None:
             attenuation_distance = math.inf
@@ -181,7 +182,7 @@ class Medium:
 
     @property
     def reduced(self) -> np.ndarray:
-        """Reduced scattering σs' = σs (1 - g), which scatters as much if it is even in all directions."""
+        """Reduced scattering σs' = σs (1 - g) per metre: isotropic scattering with the same effect."""
         return np.array(self.scattering) * (1 - self.g)
 
     @property
@@ -202,19 +203,24 @@ class Medium:
 
     @property
     def lost(self) -> Triple:
-        """1 - α', the share of light that each collision absorbs under even scattering; 1 where nothing scatters."""
+        """1 - α', the share of light that each collision absorbs under isotropic scattering; 1 where nothing
+        scatters.
+        """
         sigma, reduced = np.array(self.absorption), self.reduced
         whole = np.where(np.isfinite(sigma) & (reduced > 0), sigma + reduced, 1.0)
         return _triple(np.where(np.isfinite(sigma) & (reduced > 0), sigma, 1.0) / whole)
 
     @property
     def spread(self) -> Triple:
-        """Radius in metres within which 95 % of the leaving light leaves; 0 in a channel that reflects nothing
-        [Jensen2001]."""
+        """Radius in metres that 95 % of the leaving light stays within [Jensen2001]; 0 in a channel that reflects
+        nothing.
+        """
         return _triple(self._path * within(SHARE, self.lost, self.ior))
 
     def beyond(self, radius: float) -> Triple:
-        """Share of the leaving light that leaves farther than `radius` metres from where it entered [Jensen2001]."""
+        """Return the share of the leaving light that leaves farther than `radius` metres from where it entered
+        [Jensen2001].
+        """
         path = self._path
         some = path > 0
         return _triple(np.where(some, beyond(radius / np.where(some, path, 1.0), self.lost, self.ior), 0.0))
@@ -225,7 +231,7 @@ class Medium:
         return np.where(np.array(self.lost) < 1, self.mean_free_path, 0.0)
 
     def parameters(self) -> dict[str, float]:
-        """The medium's parameters for `lut diffusion --scheme dipole`, per mm."""
+        """Return the medium's parameters for `lut diffusion --scheme dipole`, per mm."""
         given = {
             f"{name}_{c}": value * 1e-3
             for name in ("absorption", "scattering")
@@ -255,7 +261,7 @@ MEDIA: Mapping[str, Medium] = {
 
 
 def medium(name: str) -> Medium:
-    """The measured medium of a name. Raises UsageError with the nearest name."""
+    """Return the measured medium called `name`. Raises UsageError with the nearest name."""
     if name not in MEDIA:
         raise UsageError(f"unknown medium {name!r}{nearest(name, MEDIA)}")
     return MEDIA[name]
@@ -284,14 +290,14 @@ class Absorption:
 
 @dataclass(frozen=True)
 class Transport:
-    """Where light leaves that was scattered inside.
+    """Where light that was scattered inside leaves.
 
     verdict is one of
     "clear"        almost no light is scattered: only refraction and absorption
     "cloudy"       some light is scattered, less than once on its way across: a volume
     "local"        diffuse light leaves within a pixel of where it entered
     "subsurface"   diffuse light leaves farther than a pixel from where it entered
-    "translucent"  as subsurface, and some of it leaves on the other side
+    "translucent"  like "subsurface", and some light leaves on the other side
     """
 
     verdict: str
@@ -323,7 +329,7 @@ class Judgement:
         return tuple(part.reason for part in (self.absorption, self.transport) if part)
 
     def data(self) -> dict[str, Any]:
-        """The judgement as JSON data, with None for infinite values."""
+        """Return the judgement as JSON data, with None for infinite values."""
         return {**_plain(asdict(self)), "subsurface": self.subsurface}  # type: ignore[dict-item]
 
 
@@ -354,7 +360,7 @@ def judge(medium: Medium, size: float | None = None, pixel: float | None = None)
 
 
 def difference(colour: Sequence[float] | np.ndarray) -> float:
-    """ΔE*ab between white and a colour in linear Rec.709 [CIE15]."""
+    """Return ΔE*ab between white and a colour in linear Rec.709 [CIE15]."""
     ratio = _XYZ @ np.asarray(colour, np.float64) / _XYZ.sum(1)
     f = np.where(ratio > (6 / 29) ** 3, np.cbrt(ratio), ratio * (29 / 6) ** 2 / 3 + 4 / 29)
     return float(np.linalg.norm([116 * (f[1] - 1), 500 * (f[0] - f[1]), 200 * (f[1] - f[2])]))
