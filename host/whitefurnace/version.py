@@ -1,4 +1,4 @@
-"""The version of the installed package: it stands once, in setup.cfg."""
+"""The version of the installed package, as setup.cfg states it."""
 
 from __future__ import annotations
 

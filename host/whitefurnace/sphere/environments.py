@@ -1,6 +1,6 @@
-"""Environments: an image, six faces or an array, checked and brought into one of two shapes, with statistics.
+"""Environments: an image, six faces or an array, checked and turned into a lat-long or a cube, with statistics.
 
-The shapes are a lat-long and a cube in the GL-direct layout.
+Cubes have the GL-direct layout.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ FACE_NAMES = (
 
 
 class Cell(NamedTuple):
-    """Where a face lies in an image: `turns` quarter turns counter-clockwise bring it upright."""
+    """The place of a face in an image: `turns` quarter turns counter-clockwise bring it upright."""
 
     column: int
     row: int
@@ -219,9 +219,10 @@ def source_digest(source: str | os.PathLike[str]) -> str:
 
 
 def extent(source: str | os.PathLike[str]) -> tuple[str, int, int]:
-    """Return the shape of an environment by its header alone: ("latlong" or "cube", rows, columns) of it or of a face.
+    """Return the shape of an environment from its header alone: ("latlong" or "cube", rows, columns).
 
-    Of a texture level 0 is read. Raises what `environment` raises for a header.
+    For a cube these are the rows and columns of a face, and for a texture the sizes of level 0. Raises the errors of
+    `environment` for a header.
     """
     path = Path(source)
     if os.path.isdir(path):
@@ -390,8 +391,8 @@ def _cells(layout: Layout, height: int, width: int) -> Iterator[tuple[slice, sli
 def faces_of(pixels: npt.NDArray[np.float32]) -> tuple[str, npt.NDArray[np.float32]] | None:
     """Return the name of the layout that an image (h, w, c) has by its aspect ratio, and its texels.
 
-    Those of a lat-long are as they are, others become faces (6, n, n, c), GL-direct. None where no layout has the
-    ratio.
+    The texels of a lat-long are returned unchanged; those of other layouts become faces (6, n, n, c), GL-direct.
+    Returns None where no layout has this aspect ratio.
     """
     try:
         layout = _layout_of(pixels.shape, "the image")
@@ -530,7 +531,7 @@ def statistics_of(env: Environment) -> dict[str, Any]:
 
 
 def channel_range(texels: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Return the least and the largest value of each channel of (..., 3) texels, (3,) each."""
+    """Return the smallest and the largest value of each channel of (..., 3) texels, (3,) each."""
     # NumPy reduces to a last axis of three 20 times slower than a plane at a time.
     planes = [texels[..., k] for k in range(3)]
     return np.array([plane.min() for plane in planes]), np.array([plane.max() for plane in planes])

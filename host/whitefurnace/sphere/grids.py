@@ -1,6 +1,6 @@
-"""The sphere in numpy: where texels and grid nodes lie, and the tables of quadrature nodes that kernels read.
+"""Places of texels and grid nodes on the sphere, and the tables of quadrature nodes that kernels read.
 
-Float64 throughout. `kernels/sphere.clh` has the same geometry for a device.
+Everything is float64. `kernels/sphere.clh` has the same geometry for a device.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ DOWN = np.array([[0, 0, 0, 0, 0, 0], [-1, -1, 0, 0, -1, -1], [0, 0, 1, -1, 0, 0]
 
 
 def cube_directions(face: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Return the unit directions (3, m) of face coordinates in [-1, 1], in the GL-direct layout.
+    """Return the unit directions (3, m) of face coordinates, in the GL-direct layout.
 
-    face: (m,) indices in the order +X -X +Y -Y +Z -Z. s, t: (m,), right and down.
+    face: (m,) indices in the order +X -X +Y -Y +Z -Z. s, t: (m,) in [-1, 1], to the right and down.
     """
     d = AXIS[:, face] + s * RIGHT[:, face] + t * DOWN[:, face]
     return d / np.sqrt(1 + s * s + t * t)
@@ -35,8 +35,9 @@ def cube_directions(face: np.ndarray, s: np.ndarray, t: np.ndarray) -> np.ndarra
 class Shape:
     """The points of a level: the texel centres of a cube, a lat-long or an octahedral map, or the nodes of a grid.
 
-    latlong, octahedral: the form; a cube where neither is set. size: edge of a face, or height of a lat-long. nodes:
-    whether the points are the nodes of an equiangular grid.
+    latlong, octahedral  the form; a cube where neither is True
+    size                 texels of a face edge, or rows of a lat-long
+    nodes                True if the points are the nodes of an equiangular grid
     """
 
     latlong: bool
@@ -70,9 +71,9 @@ class Shape:
         return cube_centres(self.size, index)
 
     def solid_angles(self, index: np.ndarray | None = None) -> np.ndarray:
-        """Return the solid angles (m,) of all texels, or of those given, in steradians.
+        """Return the solid angles (m,) of all texels, or of those with the flat indices given, in steradians.
 
-        Those of an octahedral map are right to second order in 1/size.
+        For an octahedral map they are exact to second order in 1/size.
         """
         if self.octahedral:
             return (2 / self.size) ** 2 * octahedral_density(self.directions(index))
@@ -95,7 +96,7 @@ class Shape:
         return sum(float(np.einsum("ij,ij->", weights, plane)) for plane in grey) / (12 * math.pi)
 
     def tiled(self) -> np.ndarray:
-        """Return flat indices in an order that keeps neighbours together: tiles of 4 × 4 within tiles of 8 × 8."""
+        """Return all flat indices, ordered so that neighbours stay together: tiles of 4 × 4 within tiles of 8 × 8."""
         index = np.arange(self.count, dtype=np.int32).reshape(-1, *self.dims[-2:])
         planes, height, width = index.shape
         if height % 8 or width % 8:
@@ -117,7 +118,7 @@ def latlong_centres(rows: int, columns: int, index: np.ndarray) -> np.ndarray:
 
 
 def turned_cube(texels: np.ndarray, matrix: Any) -> np.ndarray:
-    """Return a cube (6, s, s, …) as an engine stores it that reads the world's direction d at `matrix` @ d.
+    """Return a cube (6, s, s, …) in the axes of an engine that reads the world's direction d at `matrix` @ d.
 
     matrix: a signed permutation (3, 3). Whole texels change places and none is resampled.
     """
@@ -139,9 +140,10 @@ def turned_cube(texels: np.ndarray, matrix: Any) -> np.ndarray:
 
 
 def to_square(d: np.ndarray) -> np.ndarray:
-    """Return u, v in [-1, 1], (2, m), of directions (3, m) of any length on the square of an octahedral map.
+    """Return the coordinates u, v in [-1, 1], (2, m), of directions (3, m) on the square of an octahedral map.
 
-    d over |x| + |y| + |z| lies on an octahedron, whose lower half is folded out. [Praun2003]
+    The directions may have any length. d over |x| + |y| + |z| lies on an octahedron, whose lower half is folded out.
+    [Praun2003]
     """
     x, y, z = d / np.abs(d).sum(0)
     folded = y < 0
@@ -151,7 +153,9 @@ def to_square(d: np.ndarray) -> np.ndarray:
 
 
 def to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return the unit directions (3, m) of u, v in [-1, 1] on the square of an octahedral map."""
+    """Return the unit directions (3, m) of coordinates u, v in [-1, 1], (m,) each, on the square of an octahedral
+    map.
+    """
     y = 1 - np.abs(u) - np.abs(v)
     folded = y < 0
     x = np.where(folded, (1 - np.abs(v)) * _sign(u), u)
@@ -161,10 +165,10 @@ def to_direction(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def octahedral_density(d: np.ndarray) -> np.ndarray:
-    """Return dω/du dv of an octahedral map at directions (3, m).
+    """Return dω/du dv of an octahedral map at directions (3, m): (m,), in steradians.
 
-    It is 1/|p|³, p = d/(|x| + |y| + |z|) on the octahedron, whose faces stand at 1/√3 to the square and to the centre
-    alike.
+    It is 1/|p|³ with p = d/(|x| + |y| + |z|) on the octahedron. Its faces are inclined to the square and to the centre
+    by the same factor 1/√3.
     """
     return np.abs(d).sum(0) ** 3
 
@@ -183,7 +187,7 @@ def face_coordinates(d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def radiance_at(env: Environment, d: np.ndarray) -> np.ndarray:
-    """Return the radiance of an environment in directions (3, m): (m, 3) float64, its rotation included."""
+    """Return the radiance of an environment in directions d (3, m), with its rotation: (m, 3) float64."""
     c, s = math.cos(env.rotation), math.sin(env.rotation)
     x, y, z = c * d[0] + s * d[2], d[1], c * d[2] - s * d[0]
     rows, columns = env.texels.shape[-3:-1]
@@ -224,7 +228,7 @@ def octahedral_means(env: Environment, shape: Shape, index: np.ndarray, lattice:
 
 
 def source_directions(env: Environment, index: np.ndarray) -> np.ndarray:
-    """Return the world directions (3, m) of an environment's texel centres, by flat index, its rotation included."""
+    """Return the world directions (3, m) of an environment's texel centres, by flat index, with its rotation."""
     rows, columns = env.texels.shape[-3:-1]
     d = latlong_centres(rows, columns, index) if env.kind == "latlong" else cube_centres(rows, index)
     c, s = math.cos(env.rotation), math.sin(env.rotation)
@@ -232,19 +236,21 @@ def source_directions(env: Environment, index: np.ndarray) -> np.ndarray:
 
 
 def source_solid_angles(env: Environment) -> np.ndarray:
-    """Return the solid angle, in steradians, of every texel of an environment, without the axis of channels."""
+    """Return the solid angle of every texel of an environment, in steradians: the shape of its texels without
+    channels.
+    """
     shape = env.texels.shape[:-1]
     angles = latlong_solid_angles(*shape)[:, None] if len(shape) == 2 else cube_solid_angles(shape[1])
     return np.broadcast_to(angles, shape)
 
 
 def grid_tangents(n: int) -> np.ndarray:
-    """Return the face coordinates (n,) of the nodes of an equiangular grid, BEYOND of them past each edge."""
+    """Return the face coordinates of the nodes of an n × n equiangular grid, with BEYOND more nodes past each edge."""
     return np.tan((2 * np.arange(n) + 1 - n) / (n - 2 * BEYOND) * math.pi / 4)
 
 
 def bounds(directions: np.ndarray, count: int) -> np.ndarray:
-    """Return the centre and the largest chord to it of each `count` consecutive directions (3, m·count): (m, 4)."""
+    """Return the centre of each `count` consecutive directions (3, m·count) and the largest chord to it: (m, 4)."""
     d = directions.reshape(3, -1, count)
     centre = d.mean(2)
     radius = np.sqrt(((d - centre[..., None]) ** 2).sum(0).max(1))
@@ -252,7 +258,10 @@ def bounds(directions: np.ndarray, count: int) -> np.ndarray:
 
 
 def composite(cuts: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return nodes and weights on [0, 1] of a composite rule: cuts/2 cells of two Gauss points each."""
+    """Return nodes and weights on [0, 1] of a composite rule: cuts/2 cells of two Gauss points each.
+
+    cuts: number of nodes, even.
+    """
     cells = cuts // 2
     x, w = gauss(2)
     nodes = (np.arange(cells)[:, None] + x) / cells
@@ -264,11 +273,11 @@ def latlong_tables(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the quadrature tables of a lat-long image, by refined row and by refined column.
 
-    rows, columns: those of the image. x, w: nodes and weights on [0, 1] within a texel. rotation: radians.
-    scale: (rows,) of `corrections`; weights are sin θ Δθ scale then.
+    rows, columns: size of the image. x, w: nodes and weights on [0, 1] within a texel. rotation: radians. scale:
+    (rows,) of `corrections`; with it the weights are sin θ Δθ scale.
 
-    The first is (cos θ, sin θ, weight), each row's weights summing to cos θ0 - cos θ1; the second (cos φ, sin φ,
-    weight).
+    The first table has (cos θ, sin θ, weight), where each row's weights sum to cos θ0 - cos θ1; the second (cos φ, sin
+    φ, weight).
     """
     theta = (np.arange(rows)[:, None] + x) * (math.pi / rows)
     weight = np.sin(theta) * w
@@ -289,11 +298,11 @@ def cube_tables(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the quadrature tables of a cube's face, by refined row and by refined column.
 
-    size: texels an edge. x, w: nodes and weights on [0, 1] within a texel.
-    scale: (size,) of `corrections`, which takes the place of the factors below.
+    size: texels of an edge. x, w: nodes and weights on [0, 1] within a texel. scale: (size,) of `corrections`, which
+    replaces the factors below.
 
-    Both are (coordinate, weight, 0); the second is flat and followed by factors (size, size) that bring each texel's
-    nodes to its exact solid angle. Many nodes get there to 1e-9 by themselves: factors of 1.
+    Both tables have (coordinate, weight, 0). The second is flat and followed by factors (size, size) that bring each
+    texel's nodes to its exact solid angle. Where there are so many nodes that they reach it to 1e-9, the factors are 1.
     """
     s = ((np.arange(size)[:, None] + x) * (2 / size) - 1).ravel()
     weight = np.tile(w * (2 / size), size)
@@ -318,8 +327,8 @@ class Correction:
     row_tap, column_tap: (count, TAPS) int32, the inputs of each output row and column.
     row_factor, column_factor: (count, TAPS) float32, their factors.
     inner: the factors of a column far from the sides of the image.
-    scales: (rows,) and (columns,), what the filter makes of an image of ones. Factors are divided by it, and the
-      weights of nodes are multiplied.
+    scales: (rows,) and (columns,), the filter's result for an image of ones. Factors are divided by it, and the weights
+    of nodes are multiplied by it.
     """
 
     row_tap: np.ndarray
@@ -332,7 +341,7 @@ class Correction:
 
 @lru_cache(maxsize=16)
 def corrections(latlong: bool, rows: int, columns: int) -> Correction:
-    """Return the correction of a lat-long or a cube face of rows × columns texels, at least 16 of both."""
+    """Return the correction of a lat-long or a cube face of rows × columns texels, at least 16 each."""
     c = np.array([*CENTRED[:0:-1], *CENTRED])
     if latlong:
         row: list[dict[int, float]] = [{} for _ in range(rows)]
@@ -373,9 +382,9 @@ def _taps(found: list[dict[int, float]]) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def row_edges(rows: int, real: Any) -> np.ndarray:
-    """Return (cos θ, cot θ) of the rows + 1 edges of a lat-long's rows, (rows + 1, 2) of the type `real`.
+    """Return (cos θ, cot θ) of the rows + 1 edges of a lat-long's rows, (rows + 1, 2).
 
-    The cotangents of the poles are ±1e30, which serve as bounds only.
+    real: the type of the result. The cotangents of the poles are ±1e30, which serve as bounds only.
     """
     theta = np.arange(rows + 1) * math.pi / rows
     cosine, sine = np.cos(theta), np.sin(theta)
@@ -387,10 +396,10 @@ def row_edges(rows: int, real: Any) -> np.ndarray:
 
 @cache
 def coarsening(fine: int, coarse: int, kind: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the matrix (fine, coarse) that interpolates between equiangular nodes, and the fine nodes it touches.
+    """Return the matrix (fine, coarse) that interpolates between equiangular nodes, and the fine nodes it uses.
 
-    kind: "f" or "d", the type of the matrix. The second and third, (coarse,) int32, are the range [first, last) of fine
-    nodes that each coarse node takes part in.
+    fine, coarse: numbers of nodes. kind: "f" or "d", the type of the matrix. The second and third value, (coarse,)
+    int32 each, are the range [first, last) of fine nodes that each coarse node contributes to.
     """
     order = min(ORDER, coarse)
     ratio = (coarse - 2 * BEYOND) / (fine - 2 * BEYOND)

@@ -1,4 +1,4 @@
-"""Spherical harmonics to degree 2: irradiance, its least value, windows against ringing, and engines' scalings.
+"""Spherical harmonics to degree 2: irradiance and its minimum, windows against ringing, and engines' scalings.
 
 Coefficients are (9, 3) or (..., 9, 3): L00, L1-1, L10, L11, L2-2, L2-1, L20, L21, L22 by RGB, of a real orthonormal
 basis in world x, y, z without the Condon-Shortley sign. Irradiance is E/π: a constant environment of 1 gives 1.
@@ -89,17 +89,18 @@ def coefficients_of(c: np.ndarray, b: np.ndarray, q: np.ndarray) -> np.ndarray:
 
 
 def minimum(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least value (...) over the sphere of functions with coefficients (..., 9), and the unit vectors there.
+    """Return the smallest value (...) over the sphere of functions with coefficients (..., 9), and its unit vectors.
 
-    Exact, not sampled. On |n| = 1 the stationary points of c + b·n + nᵀQn are (Q - μ)n = -b/2, and the least value is
-    that of the only μ ≤ λ₁, the least eigenvalue: the trust-region problem with its boundary [MoreSorensen1983]. With t
-    = λ₁ - μ ≥ 0, δᵢ = λᵢ - λ₁ and b in the eigenvectors' basis |n| = 1 is the secular equation
+    The minimum is exact, not sampled. On |n| = 1 the stationary points of c + b·n + nᵀQn are (Q - μ)n = -b/2, and the
+    minimum is at the only μ ≤ λ₁, the smallest eigenvalue: the trust-region problem with its boundary
+    [MoreSorensen1983]. With t = λ₁ - μ ≥ 0, δᵢ = λᵢ - λ₁ and b in the eigenvectors' basis, |n| = 1 is the secular
+    equation
 
         g(t) = Σ bᵢ² / (2(δᵢ + t))² = 1,   where   f = c + λ₁ - t - Σ bᵢ² / (4(δᵢ + t)).
 
-    If g(0) ≤ 1 (b has nothing along the first eigenvector) t = 0, and that eigenvector makes up the length of n. At any
-    t ≥ 0 the second line is no more than the least value (Lagrange's dual), so rounding of t errs to the second order
-    and to the safe side.
+    If g(0) ≤ 1 (b has no component along the first eigenvector), t = 0 and that eigenvector completes n to unit length.
+    At any t ≥ 0 the second formula is at most the minimum (Lagrange's dual), so rounding of t has an error of second
+    order, and on the safe side.
     """
     c, b, q = polynomial(coefficients)
     eigenvalues, axes = np.linalg.eigh(q)
@@ -140,14 +141,14 @@ def minimum(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def least_irradiance(sh: np.ndarray) -> np.ndarray:
-    """Return the least E/π of each channel over all normals, from radiance coefficients (..., 9, 3): (..., 3)."""
+    """Return the smallest E/π of each channel over all normals, (..., 3), from radiance coefficients (..., 9, 3)."""
     return minimum(np.swapaxes(cosine(sh), -1, -2))[0]
 
 
 # -------------------------------------------------------------------------------------------------- window
 @dataclass(frozen=True)
 class Windowed:
-    """Radiance coefficients under a window, and the least irradiance without and with it."""
+    """Radiance coefficients after a window, and the smallest irradiance without and with it."""
 
     values: np.ndarray  # (..., 9, 3)
     mode: str | float
@@ -161,7 +162,7 @@ WINDOWS = ("auto", "none")
 
 
 def sh_window(text: str) -> str | float:
-    """Return the mode in the text of `--sh window=auto|none|X`. Raises UsageError in one sentence."""
+    """Return the mode in the text of `--sh window=auto|none|X`. Raises UsageError."""
     name, equals, value = text.partition("=")
     if name != "window" or not equals:
         raise UsageError(f"SH option {text!r} is not window=auto, window=none or window=X")
@@ -191,17 +192,17 @@ def sinc_window(cutoff: float) -> np.ndarray:
 
 
 def windowed(sh: np.ndarray, mode: str | float = "auto") -> Windowed:
-    """Return radiance coefficients with degrees 1 and 2 damped so that their irradiance does not ring below zero.
+    """Return radiance coefficients with degrees 1 and 2 damped so that their irradiance does not become negative.
 
-    sh: (..., 9, 3). One window is used for all channels, since a window each would turn the hue.
-    mode: "none" leaves them alone. A number X in [1, 1024] is `sinc_window(X)`: small damps most; X ≤ 3 is enough for
-      any environment that is nowhere negative, as it is enough for one sun. "auto" is the window with factors in [0, 1]
-      nearest to none, in RMS of E/π over sphere and channels, for which E ≥ 0 for every normal and channel: none at all
-      where that holds already. As the coefficients are the irradiance's projection, it is also the one with the least
-      RMSE against the true irradiance.
+    sh: (..., 9, 3). One window is used for all channels, since separate windows would change the hue.
+    mode: "none" leaves them alone. A number X in [1, 1024] is `sinc_window(X)`, where a small X damps most; X ≤ 3 is
+    enough for any environment without negative radiance, since it is enough for a single sun. "auto" is the window with
+    factors in [0, 1] nearest to none, in RMS of E/π over sphere and channels, for which E ≥ 0 for every normal and
+    channel; it is none where that holds already. As the coefficients are the projection of the irradiance, it also has
+    the smallest RMSE against the true irradiance.
 
-    Raises InputError for coefficients that are not finite, of another shape, or under "auto" of a negative mean, which
-    no window mends; UsageError for another mode.
+    Raises InputError for coefficients that are not finite, of another shape, or under "auto" with a negative mean,
+    which no window mends; UsageError for another mode.
     """
     sh = np.asarray(sh)
     if sh.ndim < 2 or sh.shape[-2:] != (9, 3):
@@ -286,10 +287,10 @@ def _edge(channels: np.ndarray, mean: np.ndarray, ray: np.ndarray) -> tuple[np.n
 def rmse_against(
     sh: np.ndarray, irradiance: np.ndarray, directions: np.ndarray, solid_angles: np.ndarray
 ) -> tuple[float, float]:
-    """Return the relative RMSE of E/π by radiance coefficients, and its largest |error| over the mean.
+    """Return the relative RMSE of E/π by radiance coefficients, and its largest |error| relative to the mean.
 
-    sh: (9, 3). irradiance: the true cube, (6, s, s, 3). directions, solid_angles: of its texel centres, (3, 6s²) and
-    (6s²,). 0/0 is 0.
+    sh: (9, 3). irradiance: the true cube, (6, s, s, 3). directions: unit directions of its texel centres, (3, 6s²).
+    solid_angles: (6s²,), steradians. 0/0 is 0.
     """
     want = np.asarray(irradiance, np.float64).reshape(-1, 3)
     weights = np.asarray(solid_angles, np.float64).reshape(-1, 1)
@@ -303,8 +304,7 @@ def rmse_against(
 def turned(sh: np.ndarray, matrix: Any) -> np.ndarray:
     """Return radiance coefficients (..., 9, 3) for an engine that reads our direction d at P d.
 
-    matrix: P, a signed permutation (3, 3). L'(P d) = L(d), so b' = P b and Q' = P Q Pᵀ; the least value does not
-    change.
+    matrix: P, a signed permutation (3, 3). L'(P d) = L(d), so b' = P b and Q' = P Q Pᵀ; the minimum does not change.
     """
     p = np.asarray(matrix, np.float64)
     if (p == np.eye(3)).all():
@@ -315,23 +315,23 @@ def turned(sh: np.ndarray, matrix: Any) -> np.ndarray:
 
 # ------------------------------------------------------------------------------------------------ scalings
 def radiance(sh: np.ndarray) -> np.ndarray:
-    """Return radiance coefficients as they are."""
+    """Return radiance coefficients unchanged."""
     return sh
 
 
 def irradiance(sh: np.ndarray) -> np.ndarray:
     """Return coefficients of E with the Condon-Shortley sign, for glTF's EXT_lights_image_based.
 
-    A constant environment of 1 gives π. The text of the extension names no sign; Babylon.js, which loads it, and `cmgen
-    --sh -i` have that one.
+    A constant environment of 1 gives π. The extension does not specify the sign; Babylon.js, which loads it, and `cmgen
+    --sh -i` use this one.
     """
     return cosine(sh) * (math.pi * CONDON_SHORTLEY)[:, None]
 
 
 def filament(sh: np.ndarray) -> np.ndarray:
-    """Return what Filament's shader multiplies by 1, y, z, x, yx, yz, 3z² - 1, zx, x² - y².
+    """Return the factors (..., 9, 3) by which Filament's shader multiplies 1, y, z, x, yx, yz, 3z² - 1, zx, x² - y².
 
-    It is E/π with the basis's factors folded in (libs/ibl CubemapSH::preprocessSHForShader, shaders
+    Their sum is E/π; the factors of the basis are included (libs/ibl CubemapSH::preprocessSHForShader, shaders
     Irradiance_SphericalHarmonics).
     """
     return cosine(sh) * FACTORS[:, None]
@@ -361,9 +361,9 @@ def _from_polynomial() -> np.ndarray:
 
 
 def babylon(sh: np.ndarray) -> np.ndarray:
-    """Return the nine RGB vectors x, y, z, xx, yy, zz, yz, zx, xy of a Babylon.js .env file.
+    """Return the nine RGB vectors x, y, z, xx, yy, zz, yz, zx, xy of a Babylon.js .env file, (..., 9, 3).
 
-    Babylon's shader makes E/π of them. They are not the polynomial of E/π itself: see `_from_polynomial`.
+    Babylon's shader computes E/π from them. They are not the polynomial of E/π itself: see `_from_polynomial`.
     """
     return np.asarray(np.linalg.inv(_from_polynomial()) @ cosine(sh))
 

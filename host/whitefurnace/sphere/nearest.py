@@ -1,4 +1,4 @@
-"""Finds the texels of a level nearest to given directions, which a certificate checks beside its uniform draw."""
+"""Finds the texels of a level that are nearest to given directions; certificates check them besides a uniform draw."""
 
 from __future__ import annotations
 

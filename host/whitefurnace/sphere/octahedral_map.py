@@ -24,9 +24,9 @@ def texel_directions(size: int) -> np.ndarray:
 def add_border(image: np.ndarray, b: int) -> np.ndarray:
     """Return `image` (n, n, c) with a border of b ≤ n texels around it, (n + 2b, n + 2b, c).
 
-    Beyond an edge stand the texels that lie there on the sphere. Each edge is folded onto itself at its middle, (−1, v)
-    and (−1, −v) being one direction, so the texel k beyond an edge equals the texel k within, in reverse order along
-    the edge. At a corner both hold, which is the opposite corner.
+    A border texel has the value of the texel that lies there on the sphere. Each edge is folded onto itself at its
+    middle, since (−1, v) and (−1, −v) are one direction. So the k-th texel beyond an edge equals the k-th texel within
+    it, in reverse order along the edge. A corner of the border equals the opposite corner of the image.
     """
     n = image.shape[0]
     if image.ndim != 3 or image.shape[1] != n or not 0 <= b <= n:
@@ -56,7 +56,7 @@ def read_bilinear(image: np.ndarray, d: np.ndarray, b: int = 1) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Place:
-    """The place of a level in an atlas: the first row and column of its texels, after its border, and its side."""
+    """The place of a level in an atlas: the first row and column of its texels, inside its border, and its side."""
 
     row: int
     column: int
@@ -64,9 +64,9 @@ class Place:
 
 
 def atlas_places(size: int, levels: int, b: int) -> tuple[Place, ...]:
-    """Return the places of the levels: level 0 at the left, the others below each other at its right.
+    """Return the places of the levels in an atlas: level 0 at the left, the others below each other at its right.
 
-    size: side of level 0. b: texels of border around each.
+    size: texels on a side of level 0. levels: their number. b: texels of border around each.
     """
     if levels < 1 or size >> (levels - 1) < max(b, 1):
         raise ValueError(f"{levels} levels from {size} texels do not keep at least the {max(b, 1)} of a border")
@@ -79,9 +79,9 @@ def atlas_places(size: int, levels: int, b: int) -> tuple[Place, ...]:
 
 
 def to_atlas(levels: Sequence[np.ndarray], b: int) -> tuple[np.ndarray, tuple[Place, ...]]:
-    """Return one image (height, width, c) of maps (n >> k, n >> k, c) with their borders, and their places in it.
+    """Return one image (height, width, c) with all maps (n >> k, n >> k, c) and their borders, and their places in it.
 
-    What belongs to no map is 0.
+    Texels that belong to no map are 0.
     """
     places = atlas_places(levels[0].shape[0], len(levels), b)
     height, width = (

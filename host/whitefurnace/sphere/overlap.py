@@ -1,10 +1,10 @@
-"""The mean of a piecewise-constant source over output texels' solid angles: the float64 truth of level 0.
+"""Computes the mean of a piecewise constant source over output texels in float64: the reference of level 0.
 
 `kernels/overlap.cl` finds the areas of overlap in closed form, from arcs of great circles and by clipping polygons;
 here they are iterated integrals. A lat-long source is integrated over azimuth by Gauss nodes and along the meridian
 exactly; a cube source over a face coordinate s by Gauss nodes and along t exactly. Between the breakpoints (source
 columns, corners, places where a side of the texel crosses a row) the integrand is analytic and the rows that a side
-lies in are fixed, so a texel is left with rounding only.
+lies in are fixed, so only rounding errors remain.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ piece."""
 def mean_over_texels(
     texels: npt.NDArray[np.float32], rotation: float, latlong_output: bool, size: int, indices: npt.NDArray[np.integer]
 ) -> Floats:
-    """Return the mean radiance of a source over each output texel, by exact solid angles: (m, 3) float64.
+    """Return the mean radiance of a source over output texels, by exact solid angles: (m, 3) float64.
 
     texels: radiance, (h, w, 3) of a lat-long or (6, n, n, 3) of a cube in the GL-direct layout, constant over each
-      texel.
-    rotation: radians by which the azimuth atan2(z, x) of the source grows.
-    latlong_output, size: whether the output is a lat-long (size, 2 size), else a cube (6, size, size).
+    texel.
+    rotation: radians that are added to the azimuth atan2(z, x) of the source.
+    latlong_output, size: True for a lat-long (size, 2 size), False for a cube (6, size, size).
     indices: (m,) flat indices of output texels.
 
     The error is about 1e-12 of the largest radiance that touches the texel (`tests/sphere/test_overlap.py`).

@@ -1,7 +1,7 @@
-"""Finds the sun of an environment and takes it out as a directional light, or clamps it.
+"""Finds the sun of an environment, and extracts it as a directional light or clamps it.
 
-A sun holds most of the light in a few texels. Engines cast its shadows from a light of its own, and a prefiltered copy
-of it would light everything twice.
+A sun holds most of the light in a few texels. Engines cast its shadows from a separate light, and a prefiltered copy of
+it would light everything twice.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ BESIDE = 2.5
 
 @dataclass(frozen=True)
 class Sun:
-    """A sun as a directional light; RGB each.
+    """A sun as a directional light, in linear RGB.
 
-    direction: points to it, a unit vector in the world.
-    angular_radius: radians, of a disc of constant `radiance` with the sun's energy and ∫ L² dω.
-    irradiance: that of a surface that faces it.
+    direction: unit vector towards it, in the world.
+    angular_radius: radians of a disc of constant `radiance` with the sun's energy and ∫ L² dω.
+    irradiance: irradiance of a surface that faces it.
     c: irradiance/π, the radiance of a white Lambertian surface that faces it, which is the light colour of
-      [Hoffman2012] and of most engines.
-    share: its part of the energy of the source.
-    texels: how many held it.
+    [Hoffman2012] and of most engines.
+    share: its share of the energy of the source, in [0, 1].
+    texels: number of texels that held it.
     """
 
     direction: tuple[float, float, float]
@@ -88,11 +88,12 @@ def sun_mode(mode: str) -> tuple[str, float]:
 def without_sun(env: Environment, mode: str) -> tuple[Environment, Sun | None]:
     """Return the environment with its sun treated as `mode` says, and the sun where it was extracted.
 
-    extract: the texels that stand out around the brightest are filled with the mean of the sky beside them. What they
-      held above it is the sun, so sun and sky add up to the source.
-    clamp=X: no texel keeps more than X times the mean, by the mean of its channels. Colours stay.
+    "extract": the texels that stand out around the brightest one are filled with the mean of the sky next to them. The
+    rest of their radiance is the sun, so sun and sky add up to the source.
+    "clamp=X": no texel keeps more than X times the mean, measured by the mean of its channels. Colours stay.
+    "keep": nothing changes.
 
-    Notices say what was taken. Raises UsageError for another mode.
+    Notices of the environment say what was removed. Raises UsageError for another mode.
     """
     name, bound = sun_mode(mode)
     if name == "keep":

@@ -1,4 +1,4 @@
-"""Axes of a table: their values, how they are given, which a table has by itself, and the columns that follow."""
+"""Axes of a table: their values, their syntax, the default axes of a table, and the parameter columns that follow."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Axis:
     scale: str = "linear"
 
     def values(self) -> np.ndarray:
-        """The (count,) values, float64."""
+        """Return the (count,) values, float64."""
         if self.scale == "centres":
             return self.low + (np.arange(self.count) + 0.5) * ((self.high - self.low) / self.count)
         if self.scale == "log":
@@ -69,7 +69,10 @@ class Axis:
         return np.where(share == 0, self.low, np.where(share == 1, self.high, indices))
 
     def at(self, share: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values and texel coordinates (0 is the first value) at shares in [0, 1] of the axis as it is read."""
+        """Return values and texel coordinates at positions along the axis as a GPU reads it.
+
+        share: positions in [0, 1]. Texel coordinate 0 is the first value.
+        """
         if self.scale == "log":
             values = self.low * (self.high / self.low) ** share
         elif self.scale == "f0":
@@ -81,7 +84,7 @@ class Axis:
         return values, share * self.count - 0.5 if self.scale == "centres" else share * (self.count - 1)
 
     def canonical(self) -> dict[str, Any]:
-        """The axis as a manifest states it."""
+        """Return the axis as a manifest states it."""
         return {"name": self.name, "from": self.low, "to": self.high, "count": self.count, "scale": self.scale}
 
     def __str__(self) -> str:
@@ -113,7 +116,7 @@ Ends = tuple[float, float, int, str]
 
 
 def axis(name: str, given: AxisSpec) -> Axis:
-    """An axis from `A:B:N`, `A:B:N:SCALE` or a tuple of the same. Raises UsageError."""
+    """Return the axis of `A:B:N`, `A:B:N:SCALE` or a tuple of the same. Raises UsageError."""
     if isinstance(given, Axis):
         return given
     parts = given.split(":") if isinstance(given, str) else list(given)
@@ -157,7 +160,7 @@ class Size:
 
 
 def size_of(given: int | str | Sequence[int]) -> Size:
-    """The size from `N`, "NxM" or a pair. Raises UsageError."""
+    """Return the size of `N`, "NxM" or a pair of numbers. Raises UsageError."""
     items: list[Any] = (
         given.lower().replace("×", "x").split("x")
         if isinstance(given, str)
@@ -175,7 +178,10 @@ def size_of(given: int | str | Sequence[int]) -> Size:
 
 
 def named(option: str, given: Sequence[str]) -> dict[str, str]:
-    """Values by name from items `NAME=VALUE` of an option "--axis", "axis", "--set" or "set". Raises UsageError."""
+    """Return values by name from items `NAME=VALUE`.
+
+    option: the option they come from, "--axis", "axis", "--set" or "set", for error messages. Raises UsageError.
+    """
     found: dict[str, str] = {}
     for item in given:
         name, equals, value = item.partition("=")
@@ -187,12 +193,15 @@ def named(option: str, given: Sequence[str]) -> dict[str, str]:
 
 
 def named_axes(option: str, given: Sequence[str]) -> dict[str, str]:
-    """The same for axes, of which a scale alone is that of NoV. Raises UsageError."""
+    """Return axes by name from items `NAME=AXIS`. A scale alone, such as "sqrt", is that of NoV.
+
+    option: the option they come from, for error messages. Raises UsageError.
+    """
     return named(option, [f"NoV={item}" if item in SCALES else item for item in given])
 
 
 def number(name: str, value: Any) -> float:
-    """The value of a fixed parameter, a finite number. Raises UsageError."""
+    """Return the value of a fixed parameter as a finite number. Raises UsageError."""
     try:
         found = float(value)
     except (TypeError, ValueError):
@@ -213,7 +222,7 @@ def number(name: str, value: Any) -> float:
 
 
 def centred(size: Size) -> dict[str, Axis]:
-    """The default axes of most tables: x is NoV and y roughness, both at the centres of texels."""
+    """Return the default axes of most tables: x is NoV and y roughness, both at the centres of texels."""
     return {
         "NoV": Axis("NoV", 0.0, 1.0, size.across, "centres"),
         "roughness": Axis("roughness", 0.0, 1.0, size.down, "centres"),
@@ -233,8 +242,11 @@ def usual_beside(
 
 
 def over_first_parameter(choice: Chosen, fixed: Collection[str], count: int) -> dict[str, Axis]:
-    """An axis over the first parameter of a model that has no value: over its domain where that ends at 1, otherwise
-    from the least to the largest of its typical values."""
+    """Return an axis over the first parameter of a model that has no value.
+
+    It covers the parameter's domain if that ends at 1, otherwise the range of its typical values. fixed: names of
+    parameters that have values. count: number of values.
+    """
     free = [
         p
         for p in choice.model.parameters
@@ -247,7 +259,7 @@ def over_first_parameter(choice: Chosen, fixed: Collection[str], count: int) -> 
 
 
 def following(choice: Chosen, taken: Collection[str]) -> list[str]:
-    """The parameters of a model that follow roughness and are not given otherwise; `taken` are the names given."""
+    """Return the parameters of a model that follow roughness, except those in `taken`."""
     entry = choice.model
     follow = entry.from_roughness(0.5) if entry.from_roughness else {}
     return [
@@ -267,12 +279,12 @@ def placed(
     axes: Mapping[str, AxisSpec],
     fixed: Mapping[str, float],
 ) -> tuple[Axis, ...]:
-    """The axes of a table in their order, x first.
+    """Return the axes of a table in their order, x first.
 
-    default: the table's own axes in their order. One that is fixed is dropped, and so are NoV where there is no view
-        and roughness where no model follows it.
-    axes: those given, by name. One with the name of a default axis replaces it in its place, or scales it; the others
-        come after, slower, in their order.
+    default: the table's own axes in their order. An axis that is fixed is dropped, and so are NoV where the integral
+    has no view and roughness where no model follows it.
+    axes: the given axes, by name. An axis with the name of a default axis replaces it in its place, or changes its
+    scale; the others come after and vary more slowly.
 
     Raises UsageError.
     """
@@ -307,7 +319,9 @@ def placed(
 def columns_of(
     axes: Sequence[Axis | Points], models: Mapping[str, Chosen], fixed: Mapping[str, float]
 ) -> dict[str, np.ndarray]:
-    """The parameters that `integrate` takes: numbers, and arrays that broadcast to […, y, x]. Raises UsageError."""
+    """Return the parameters that `integrate` takes: numbers, and arrays that broadcast to […, y, x]. Raises
+    UsageError.
+    """
     dimensions = max(len(axes), 2)  # [y, x] at least
     columns = {name: np.array(value) for name, value in fixed.items()}
     for k, one in enumerate(axes):

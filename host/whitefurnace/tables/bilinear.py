@@ -23,7 +23,7 @@ FAINT = 1e-2
 
 
 def hats(count: int, x: np.ndarray) -> np.ndarray:
-    """Weights (n, count) of the texels of an axis in linear reads at the texel coordinates x, (n,).
+    """Return the weights (n, count) of the texels of an axis in linear reads at the texel coordinates x, (n,).
 
     Coordinate 0 is the centre of the first texel. Coordinates beyond the ends are clamped.
     """
@@ -37,15 +37,15 @@ def hats(count: int, x: np.ndarray) -> np.ndarray:
 
 
 def read(texels: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Reads (ny, nx, c) of texels (M, N, c), with the weights `down` (ny, M) and `across` (nx, N) of `hats`."""
+    """Read texels (M, N, c) with the weights `down` (ny, M) and `across` (nx, N) of `hats`: (ny, nx, c)."""
     return np.stack([down @ texels[..., c] @ across.T for c in range(texels.shape[2])], -1)
 
 
 def fit(truth: np.ndarray, down: np.ndarray, across: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Texels (M, N, c), float64, for which the largest error of reads against `truth` (ny, nx, c) is small.
+    """Return texels (M, N, c), float64, for which the largest error of reads against `truth` (ny, nx, c) is small.
 
-    down, across: weights of the reads, from `hats`. counted: (ny,) booleans, the rows whose errors matter. Weighted
-    least squares, whose weights follow the errors of the round before.
+    down, across: weights of the reads, from `hats`. counted: (ny,) booleans, the rows whose errors matter. The fit is
+    weighted least squares, whose weights follow the errors of the round before.
     """
     wy, wx = np.where(counted, 1.0, FAINT), np.ones(truth.shape[1])
     best, least = np.empty(0), np.inf
@@ -64,7 +64,7 @@ def fit(truth: np.ndarray, down: np.ndarray, across: np.ndarray, counted: np.nda
 
 
 def formats(texels: np.ndarray, dtype: np.dtype[Any]) -> Mapping[str, np.ndarray]:
-    """The texels as each format holds them, by its name, rounded to nearest.
+    """Return the texels as each pixel format holds them, by its name, rounded to nearest.
 
     The formats are `dtype`, float16 where the values fit, and r8 (8 bits from 0 to 1, clamped) where the values lie
     between -0.1 and 1.1: a fit may leave them slightly outside [0, 1].
@@ -78,6 +78,9 @@ def formats(texels: np.ndarray, dtype: np.dtype[Any]) -> Mapping[str, np.ndarray
 
 
 def errors(off: np.ndarray, counted: np.ndarray) -> dict[str, float]:
-    """Statistics of the absolute errors `off` (ny, nx, c): `p99` and `max` of the rows `counted`, `max_all` of all."""
+    """Return statistics of the absolute errors `off` (ny, nx, c).
+
+    `p99` and `max` are over the rows `counted`, `max_all` over all rows.
+    """
     some = off[counted]
     return {"p99": float(np.quantile(some, 0.99)), "max": float(some.max()), "max_all": float(off.max())}

@@ -1,4 +1,4 @@
-"""The cells of a table (models, parameters, light) and how they are to be computed: what a kind of table works on."""
+"""The cells of a table (models, parameters, light) and the settings of their computation, for all kinds of table."""
 
 from __future__ import annotations
 
@@ -16,9 +16,10 @@ from whitefurnace.tables.axes import Axis, Points, columns_of
 
 @dataclass(frozen=True)
 class Lighting:
-    """The light that a table is lit by.
+    """The light of a table of reflected radiance.
 
-    arguments: as `whitefurnace.integrate` takes them. recipe: what a manifest states of an environment.
+    arguments  light arguments of `whitefurnace.integrate`
+    recipe     facts about an environment that a manifest states
     """
 
     arguments: Mapping[str, Any] = field(default_factory=dict)
@@ -29,8 +30,9 @@ class Lighting:
 class Cells:
     """A grid of parameters of some models.
 
-    axes: those of the table, x first. fixed: parameters that are one number. points: values at which the table is
-    computed instead of at those of its axes.
+    axes    axes of the table, x first
+    fixed   parameters that are one number
+    points  values at which the table is computed instead of at those of its axes
     """
 
     models: Mapping[str, Chosen]
@@ -43,31 +45,33 @@ class Cells:
 
     @cached_property
     def columns(self) -> dict[str, np.ndarray]:
-        """The parameters as `integrate` takes them: numbers, and arrays that broadcast to […, y, x]."""
+        """Return the parameters as `integrate` takes them: numbers, and arrays that broadcast to […, y, x]."""
         return self.columns_at(self.axes if self.points is None else self.points)
 
     def columns_at(
         self, points: Sequence[Axis | Points], models: Mapping[str, Chosen] | None = None
     ) -> dict[str, np.ndarray]:
-        """The parameters at other values of the axes, or for other models."""
+        """Return the parameters at other values of the axes, or for other models, as `columns` does."""
         return columns_of(points, self.models if models is None else models, self.fixed)
 
     def columns_for(self, models: Mapping[str, Chosen]) -> dict[str, np.ndarray]:
-        """The parameters of the same cells for other models."""
+        """Return the parameters of the same cells for other models, as `columns` does."""
         return self.columns_at(self.axes if self.points is None else self.points, models)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The shape of the grid, […, y, x], without channels."""
+        """Shape of the grid, […, y, x], without channels."""
         return np.broadcast_shapes(*map(np.shape, self.columns.values()))
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Models, parameters and `backfacing`, as `integrate` takes them."""
+        """Return models, parameters and `backfacing`, as `integrate` takes them."""
         return {**self.models, **self.columns, "backfacing": self.backfacing}
 
     def middle(self) -> dict[str, np.ndarray] | None:
-        """The parameters in the middle of every four texels; None where the axes are not two with two texels each."""
+        """Return the parameters in the middle of every four texels; None unless there are two axes of at least two
+        texels each.
+        """
         if len(self.axes) != 2 or min(a.count for a in self.axes) < 2:
             return None
         points = []
@@ -83,10 +87,13 @@ class Cells:
 
 @dataclass(frozen=True)
 class Run:
-    """How cells are computed.
+    """Settings of a computation of cells.
 
-    device: None for a kind that needs none. precision: 32 or 64. tolerance: absolute. out: the array to fill, or None
-    for a new one. progress: called with the share done.
+    device     the device; None for a kind that needs none
+    precision  32 or 64 bits
+    tolerance  absolute tolerance
+    out        array to fill, or None for a new one
+    progress   called with the share of the work done
     """
 
     device: Device
@@ -97,5 +104,5 @@ class Run:
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Device, precision, tolerance and `out`, as `integrate` takes them."""
+        """Return device, precision, tolerance and `out`, as `integrate` takes them."""
         return {"device": self.device, "precision": self.precision, "tolerance": self.tolerance, "out": self.out}

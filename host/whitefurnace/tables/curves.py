@@ -1,5 +1,8 @@
-"""Simple curves that replace costly functions in shaders: a rational function for Smith's term of any NDF, and a
-polynomial for the norm of an NDF. Both are fitted for the smallest maximum error and written as C and GLSL."""
+"""Fits simple curves that replace costly functions in shaders, and writes them as C and GLSL.
+
+A rational function replaces Smith's term of any NDF, and a polynomial the norm of an NDF. Both are fitted for the
+smallest maximum error.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +45,7 @@ LOBES = {"abc": "1/(1 + b (1 - cos θ))^c", "shifted_gamma": "exp(-t/alpha) (1 +
 
 @dataclass(frozen=True)
 class Span:
-    """A variable of a fit, which a call maps from [low, high] to [-1, 1], by its logarithm if `log`."""
+    """A variable of a fit. Calling it maps values from [low, high] to [-1, 1], by their logarithm if `log` is True."""
 
     name: str
     low: float
@@ -60,10 +63,11 @@ class Span:
 
 
 def least_largest(residuals: Callable[[np.ndarray], np.ndarray], start: np.ndarray, steps: int = 40) -> np.ndarray:
-    """Parameters for which the largest |residual| is about as small as can be, from those of `start`.
+    """Return parameters for which the largest |residual| is nearly as small as possible, beginning at `start`.
 
-    Sums of growing powers of the residuals are minimized one after the other, by damped Gauss-Newton steps with a
-    numerical derivative. [Marquardt1963]
+    residuals: function from parameters to residuals. steps: largest number of steps for each power. Sums of growing
+    powers of the residuals are minimized one after the other, by damped Gauss-Newton steps with a numerical derivative.
+    [Marquardt1963]
     """
     best = at = start.astype(np.float64)
     now = residuals(at)
@@ -105,7 +109,7 @@ def least_largest(residuals: Callable[[np.ndarray], np.ndarray], start: np.ndarr
 
 
 def smith_check(slots: Mapping[str, Chosen]) -> None:
-    """Raise UnsupportedError for models whose Smith term does not depend on n·v alone."""
+    """Check that the Smith term of the models depends on n·v alone. Raises UnsupportedError."""
     ndf, masking = slots["ndf"].model, slots["masking"].model
     if not ndf.isotropic:
         raise UnsupportedError(f"smith wants an isotropic ndf; {ndf.name} is anisotropic")
@@ -114,7 +118,7 @@ def smith_check(slots: Mapping[str, Chosen]) -> None:
 
 
 def shape_of_smith(scheme: str | None, axes: Sequence[Axis]) -> tuple[int, ...]:
-    """Shape (polynomials, coefficients) of a fit of Smith's term; one coefficient if nothing but n·v varies.
+    """Return the shape (polynomials, coefficients) of a fit of Smith's term; one coefficient if only n·v varies.
 
     Raises UnsupportedError for axes other than NoV and at most one more.
     """
@@ -128,16 +132,18 @@ def shape_of_smith(scheme: str | None, axes: Sequence[Axis]) -> tuple[int, ...]:
 
 
 def area(scheme: str | None, c: np.ndarray, k: np.ndarray, q: np.ndarray) -> np.ndarray:
-    """The fitted A(c) = c/G1(c) = c + k (1 - c), times q/(q + c) in the second term for the scheme "rational"."""
+    """Return the fitted area A(c) = c/G1(c) = c + k (1 - c), with a factor q/(q + c) on the second term for "rational".
+
+    c: n·v in [0, 1]. k, q: the fitted polynomials' values.
+    """
     return c + k * (1 - c) * (q / (q + c) if scheme == "rational" else 1)
 
 
 def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, Any]]:
-    """Coefficients (polynomials, coefficients) of k, and q, as polynomials in the parameter x.
+    """Fit Smith's term: return coefficients (polynomials, coefficients) of k and q as polynomials in a parameter x.
 
-    The fit is G1(c) = c/A(c), A = c + k (1 - c) q/(q + c), c = n·v.
-
-    With q left out and k = α/2 it is Hammon's approximation of GGX's height-correlated term. [Hammon2017]
+    The fit is G1(c) = c/A(c), A = c + k (1 - c) q/(q + c), c = n·v. Without q and with k = α/2 it is Hammon's
+    approximation of GGX's height-correlated term. [Hammon2017]
     """
     start = time.perf_counter()
     ndf, axes, scheme = cells.models["ndf"], cells.axes, cells.scheme
@@ -244,13 +250,13 @@ def _pairs(scheme: str | None, k: np.ndarray, q: np.ndarray, c: np.ndarray, A: n
 
 
 def norm_axes(slots: Mapping[str, Chosen]) -> Mapping[str, Ends]:
-    """The default ranges of the parameters that are not given with the NDF."""
+    """Return the default ranges of the parameters that are not given with the NDF."""
     ndf = slots["ndf"]
     return {name: axis for name, axis in NORM_AXES.get(ndf.model.name, {}).items() if name not in ndf.given}
 
 
 def norm_check(slots: Mapping[str, Chosen]) -> None:
-    """Raise UnsupportedError for an NDF that has no costly norm."""
+    """Check that the NDF has a norm that is costly to compute. Raises UnsupportedError."""
     entry = slots["ndf"].model
     if not {"norm", "per_norm"} & set(entry.constant_names):
         raise UnsupportedError(
@@ -260,9 +266,9 @@ def norm_check(slots: Mapping[str, Chosen]) -> None:
 
 
 def shape_of_norm(axes: Sequence[Axis]) -> tuple[int, ...]:
-    """Shape (coefficients,) or (coefficients of x, of y) of a norm's polynomial of the highest degree.
+    """Return the shape (coefficients,) or (coefficients of x, of y) of a norm's polynomial of the highest degree.
 
-    Coefficients beyond the degree that is taken are 0. Raises UnsupportedError for more than two axes.
+    Coefficients beyond the chosen degree are 0. Raises UnsupportedError for more than two axes.
     """
     if not 1 <= len(axes) <= 2:
         raise UnsupportedError(f"norm is fitted over one or two parameters, not {len(axes)}: fix the others with --set")
@@ -270,10 +276,10 @@ def shape_of_norm(axes: Sequence[Axis]) -> tuple[int, ...]:
 
 
 def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, Any]]:
-    """Coefficients (n,) or (n, n) of a polynomial for ln of the norm, in one or two parameters.
+    """Fit the logarithm of the norm: return coefficients (n,) or (n, n) of a polynomial in one or two parameters.
 
-    Each parameter is mapped from its range, or the logarithm of it, to [-1, 1]. [i, j] is the coefficient of x^i y^j, x
-    being the first axis. The degree is the least that meets the tolerance, which is relative to the norm.
+    Each parameter is mapped from its range, or the logarithm of it, to [-1, 1]. [i, j] is the coefficient of x^i y^j,
+    where x is the first axis. The degree is the smallest that meets the tolerance, which is relative to the norm.
     """
     start, ndf, axes = time.perf_counter(), cells.models["ndf"], cells.axes
     entry = ndf.model
@@ -405,7 +411,7 @@ def _nested(terms: Sequence[str], name: str) -> str:
 
 
 def header(name: str, text: tuple[Sequence[str], Sequence[str]], version: str) -> str:
-    """The text of a .h for C and GLSL, its macros named after `name`."""
+    """Return the text of a .h for C and GLSL, whose macros are named after `name`."""
     lines, body = text
     guard = f"{name.upper()}_H"
     return "\n".join(

@@ -1,7 +1,7 @@
 """Pre-integrated diffusion: diffuse light on a curved body of a translucent medium, by curvature. [Penner2011]
 
-Written in numpy and not as a kernel: for each curvature the integral is a sum of a few hundred values of the profile
-with weights that no row changes, so a table is one product of two matrices.
+It is computed in numpy and not by a kernel: for each curvature the integral is a sum of a few hundred values of the
+profile, with weights that are the same in all rows, so a table is one product of two matrices.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ ROWS, COLUMNS = 64, 1024
 
 
 def profile(scheme: str | None, given: Mapping[str, float]) -> Profile:
-    """The profile of a scheme and its parameters. Raises UsageError.
+    """Return the profile of a scheme and its parameters. Raises UsageError.
 
-    Of "burley": `albedo` (diffuse reflectance) and `mfp` (mean free path in mm, 1 unless given), or, as of "dipole",
-    `absorption` and `scattering` per mm with `g` and `ior`; `albedo_r` is red's, `albedo` that of all channels
-    that have none of their own.
+    "dipole" takes `absorption` and `scattering` per mm, `g` and `ior`. "burley" takes the same, or instead `albedo`
+    (diffuse reflectance in [0, 1]) and `mfp` (mean free path in mm, 1 unless given). `albedo_r` is the value of red;
+    `albedo` is that of all channels without their own.
     """
     if scheme == "skin" or scheme is None:
         _only((), given, "skin")
@@ -105,7 +105,7 @@ def _rgb(name: str, given: Mapping[str, float], default: float | None = None) ->
 
 
 def diffusion_spec(scheme: str | None, columns: Mapping[str, np.ndarray]) -> TableSpec:
-    """The shape of what `diffusion` computes. Raises UsageError for parameters that do not fit the scheme."""
+    """Describe the array that `diffusion` computes. Raises UsageError for parameters that do not fit the scheme."""
     _parts(scheme, columns)
     return TableSpec(integral("normalization"), {}, (*np.broadcast_shapes(*(c.shape for c in columns.values())), 3), ())
 
@@ -138,13 +138,13 @@ def diffusion(
     backfacing: str | None = None,
     **others: np.ndarray,
 ) -> tuple[Integrated, dict[str, Any]]:
-    """Diffuse light D (…, 3) by the cosine NoL of the light and the curvature κ in 1/mm.
+    """Compute the diffuse light D (…, 3) for the cosine NoL of the light and the curvature κ in 1/mm.
 
     D(θ, κ) = ∫ q(2 sin(x/2)/κ) max(cos(θ + x), 0) dx / ∫ q dx over x from -π to π, θ = acos NoL.
 
-    q is the profile's line spread: the body is a cylinder of curvature κ, lit and shaded alike along its axis, and what
-    reaches a line is R integrated along the other. Of Gaussians it is what is usually tabulated; of Christensen and
-    Burley's R, which grows like 1/r, the integral of R itself over the circle is infinite.
+    q is the profile's line spread: the body is a cylinder of curvature κ, lit and shaded alike along its axis, and the
+    light that reaches a line is R integrated along the axis. For Gaussians this is what is usually tabulated. For
+    Christensen and Burley's R, which grows like 1/r, the integral of R itself over the circle is infinite.
     """
     start = time.perf_counter()
     NoL, curvature, found = _parts(scheme, {"NoL": NoL, "curvature": curvature, **others})
@@ -180,7 +180,9 @@ def _stated(found: Profile) -> dict[str, Any]:
 
 
 def integrated(found: Profile, NoL: np.ndarray, curvature: np.ndarray) -> tuple[np.ndarray, float, int]:
-    """D of each curvature and cosine, (rows, columns, 3), its absolute error, and the number of nodes of a row."""
+    """Return D for each curvature and cosine, (rows, columns, 3), its absolute error, and the number of nodes of a
+    row.
+    """
     values = np.empty((curvature.size, NoL.size, 3))
     flat = curvature * found.widest < FLAT
     values[flat] = np.maximum(NoL, 0)[:, None]

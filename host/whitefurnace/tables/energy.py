@@ -1,5 +1,4 @@
-"""The energy that single scattering loses, in the forms of three schemes that restore it; the albedo of sheen; and the
-average of a Fresnel term."""
+"""Tables of the energy that single scattering loses, of the albedo of sheen, and of the average of a Fresnel term."""
 
 from __future__ import annotations
 
@@ -78,10 +77,10 @@ def _joined(first: Integrated, *others: Integrated) -> Integrated:
 
 
 def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
-    """The table of a scheme, (…, 2), and what is stated of it if `report`.
+    """Return the table of a scheme, (…, 2), and with `report` the facts that its manifest states.
 
     scheme: "kulla_conty" gives (1 - E, 1 - E_avg), since float32 cannot hold the loss at α < .01 as a difference from
-        1; "turquin" gives (E, 1/E - 1); "fdez_aguera" gives the split-sum pair.
+    1; "turquin" gives (E, 1/E - 1); "fdez_aguera" gives the split-sum pair.
     what: arguments of `integrate`.
 
     Raises UnsupportedError for a BRDF that reflects more than arrives. [KullaConty2017; Turquin2019; FdezAguera2019]
@@ -181,7 +180,7 @@ def _grid(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> Grid:
 
 
 def fresnel_spec(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> TableSpec:
-    """The shape and the kernels of `fresnel_average`. Raises UsageError for parameters outside their domain."""
+    """Describe the array that `fresnel_average` computes. Raises UsageError for parameters outside their domain."""
     slots = {"fresnel": models["fresnel"].model}
     return TableSpec(
         integral("albedo_average"),
@@ -232,7 +231,7 @@ def fresnel_average(
     backfacing: str | None = None,
     **columns: Any,
 ) -> Integrated:
-    """The average F_avg = 2∫ F(μ) μ dμ, (…), to 1e-6 or better."""
+    """Compute the average F_avg = 2∫ F(μ) μ dμ of a Fresnel term, (…), to 1e-6 or better."""
     start, entry = time.perf_counter(), fresnel.model
     slots, grid = {"fresnel": entry}, _grid({"fresnel": fresnel}, columns)
     finest = 64 if device.fp64 else 32

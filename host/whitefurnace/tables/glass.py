@@ -1,5 +1,7 @@
-"""Rough glass: the shares of light that a boundary of two insulators reflects and transmits, by view, roughness and
-index of refraction."""
+"""Rough glass: the shares of light that a boundary of two insulators reflects and transmits.
+
+They depend on the view, the roughness and the index of refraction.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ catalogue (tests/tables/test_glass.py)."""
 
 @dataclass
 class Boundary(Part):
-    """The kernel of reflection and refraction at a boundary."""
+    """The kernel of reflection and refraction at a rough boundary, as a part of `integrate`."""
 
     @property
     def kind(self) -> str:
@@ -50,7 +52,10 @@ class Boundary(Part):
 
 
 def check(slots: Mapping[str, Chosen]) -> None:
-    """Raise UnsupportedError for an anisotropic NDF, or a masking that is not a product of one term a direction."""
+    """Check that the NDF is isotropic and that the masking is a product of one term for each direction.
+
+    Raises UnsupportedError.
+    """
     ndf, masking = slots["ndf"].model, slots["masking"].model
     if not ndf.isotropic:
         raise UnsupportedError(f"glass wants an isotropic ndf; {ndf.name} is anisotropic")
@@ -62,7 +67,7 @@ def check(slots: Mapping[str, Chosen]) -> None:
 
 
 def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
-    """Digests of the kernels, for the key of a table."""
+    """Return the digests of the kernels, for the key of a table."""
     return (source.refraction({slot: choice.model for slot, choice in slots.items()}).digest,)
 
 
@@ -80,10 +85,11 @@ def glass(
     backfacing: str | None = None,
     **columns: Any,
 ) -> tuple[Integrated, dict[str, Any]]:
-    """Shares R and T (…, 2) of the energy that arrives along v, for single scattering. [Walter2007]
+    """Compute the shares R and T (…, 2) of the energy from direction v that is reflected and transmitted.
 
     scheme: "entering" for light from the side of index 1, "leaving" for light from the other side, where Fresnel's n is
-    1/ior. The second value is what is stated of the table if `report`. Raises UnsupportedError.
+    1/ior. Facets scatter once. With `report` the second value has the facts that the manifest states. Raises
+    UnsupportedError. [Walter2007]
     """
     start = time.perf_counter()
     slots = {"ndf": ndf, "masking": masking, "fresnel": fresnel}

@@ -1,7 +1,7 @@
-"""What a kind of table says of itself; everything else about tables is the same for all kinds.
+"""The interface of a kind of table. Everything that is not declared here is the same for all kinds.
 
-This module and those in `tables/kinds` load neither numpy nor a device, since `--help` lists the kinds: what computes a
-table is imported inside the methods that need it.
+This module and those in `tables/kinds` load neither numpy nor a device, since `--help` lists the kinds: code that
+computes a table is imported inside the methods that need it.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ Facts = dict[str, Any]
 
 
 class Kind:
-    """A kind of table: `whitefurnace lut NAME`. A subclass states what differs from the defaults below.
+    """A kind of table: `whitefurnace lut NAME`. A subclass states how it differs from the defaults below.
 
-    By itself a kind is a table of texels over NoV and roughness, of an NDF and its masking, with two channels. A
-    subclass must give `name`, `summary` and `make`.
+    By default a table has texels over NoV and roughness, of an NDF and its masking, with two channels. A subclass must
+    give `name`, `summary` and `make`.
     """
 
     name: str
@@ -75,21 +75,25 @@ class Kind:
     # ------------------------------------------------------------------------------------------ checking a request
 
     def settled(self, request: TableRequest) -> tuple[Kind, TableRequest]:
-        """The kind and the request with what `for_`, an engine, decides. Raises UsageError."""
+        """Return the kind and the request after the choices that the engine `for_` makes. Raises UsageError."""
         if request.for_ is not None:
             raise UsageError(f"{self.name} is no table of engines; dfg is")
         return self, request
 
     def integral(self, scheme: str | None) -> str:
-        """The integral of the catalogue that has the parameters of this table: it says whether there is a view."""
+        """Return the integral of the catalogue that has the parameters of this table; it decides whether there is a
+        view.
+        """
         return "albedo"
 
     def usual_tolerance(self, request: TableRequest) -> float | None:
-        """The default tolerance, absolute; None for that of integrals at the precision asked for."""
+        """Return the default tolerance, absolute; None for that of integrals at the precision asked for."""
         return self.tolerance if request.precision == 32 else None
 
     def specs(self, request: TableRequest) -> dict[str, Spec]:
-        """The models that the table is of, by slot. Raises UnsupportedError for those that it cannot be of."""
+        """Return the models of the table, by slot. Raises UnsupportedError for models that this kind does not
+        support.
+        """
         if not (request.fresnel is None and request.diffuse is None and request.brdf is None):
             shown = "1" if self.fresnel == "one" else self.fresnel
             raise UnsupportedError(
@@ -99,7 +103,7 @@ class Kind:
         return {"ndf": ndf, "masking": request.masking or "smith", "fresnel": self.fresnel}
 
     def lighting(self, request: TableRequest) -> Lighting:
-        """The light of the table. Raises UsageError where it has none and one is given."""
+        """Return the light of the table. Raises UsageError for a light given to a kind that has none."""
         from whitefurnace.tables.cells import Lighting
 
         for name in ("light", "environment", "normal"):
@@ -110,7 +114,7 @@ class Kind:
     # ------------------------------------------------------------------------------------------ axes
 
     def default_axes(self, size: Size) -> dict[str, Axis]:
-        """The axes that the table has unless they are fixed or replaced, by name, x first."""
+        """Return the axes that the table has unless they are fixed or replaced, by name, x first."""
         from whitefurnace.tables.axes import centred
 
         return centred(size)
@@ -118,19 +122,19 @@ class Kind:
     def with_usual_axes(
         self, axes: Mapping[str, AxisSpec], models: Mapping[str, Chosen], fixed: Mapping[str, float], size: Size
     ) -> dict[str, AxisSpec]:
-        """The axes given, and those that the table has beside the default ones and that are neither given nor fixed."""
+        """Return the given axes, and those further axes of this kind that are neither given nor fixed."""
         from whitefurnace.tables.axes import usual_beside
 
         return usual_beside(self.usual_axes, axes, fixed)
 
     def arranged(self, axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
-        """The axes in the order in which they lie in the array, x first."""
+        """Return the axes in the order of the array, x first."""
         return axes
 
     # ------------------------------------------------------------------------------------------ computing
 
     def spec(self, cells: Cells) -> TableSpec:
-        """The shape of the array and the digests of the kernels, found without a device. Raises what checks raise."""
+        """Describe the array and the kernels, without a device. Raises the errors of the checks of the kind."""
         from dataclasses import replace
 
         from whitefurnace.integrals.quadrature import table_spec
@@ -139,27 +143,27 @@ class Kind:
         return replace(found, shape=(*found.shape[: len(cells.shape)], self.channels))
 
     def make(self, cells: Cells, run: Run, report: bool) -> tuple[Integrated, Facts]:
-        """The values of the cells, […, channel], and what is stated of them if `report`; otherwise nothing."""
+        """Compute the values of the cells, […, channel], and with `report` the facts that the manifest states."""
         raise NotImplementedError
 
     def facts(self, cells: Cells, run: Run) -> Facts:
-        """What is stated of a table whose texels are fitted."""
+        """Return the facts that the manifest states about a table whose texels are fitted."""
         return self.make(cells, run, True)[1]
 
     # ------------------------------------------------------------------------------------------ files and text
 
     def recipe(self) -> dict[str, Any]:
-        """What the key of a table depends on beside the options, by manifest key."""
+        """Return further data that decide the key of a table, in addition to the options, by manifest key."""
         return {}
 
     def header(self, name: str, facts: Facts, version: str) -> str:
-        """The text of a .h whose macros are named after `name`, of a kind with `coefficients`."""
+        """Return the text of a .h whose macros are named after `name`; for kinds with `coefficients`."""
         raise NotImplementedError
 
     def subject(self, models: Sequence[str], scheme: str | None) -> str:
-        """What a table is of, for a title: its models, else its scheme, else what the kind is."""
+        """Return the subject of a table for a title: its models, otherwise its scheme, otherwise the kind's summary."""
         return ", ".join(models) or scheme or self.summary
 
     def lines(self, manifest: Mapping[str, Any]) -> list[str]:
-        """What the command line prints of a manifest beside channels, formula and errors."""
+        """Return lines that the command line prints of a manifest, after channels, formula and errors."""
         return []

@@ -1,18 +1,19 @@
-"""Linearly transformed cosines: the matrices that light polygons with a BRDF, fitted over all cells of a table at once.
+"""Linearly transformed cosines: matrices for lighting by polygons with a BRDF, fitted for all cells of a table at once.
 
-A clamped cosine whose directions a matrix M moves is p(ω) = det N max(w.z, 0)/(π |w|⁴), w = N ω, N = M⁻¹: it integrates
-to 1 over the sphere and, over a polygon, to the form factor of the polygon moved by N [Heitz2016]. Engines load four
-numbers of N, scaled to N.yy = 1, with v = (sin θ_v, 0, cos θ_v):
+A clamped cosine whose directions are moved by a matrix M is p(ω) = det N max(w.z, 0)/(π |w|⁴), w = N ω, N = M⁻¹. Its
+integral over the sphere is 1, and over a polygon the form factor of the polygon moved by N [Heitz2016]. Engines load
+four numbers of N, scaled to N.yy = 1, with v = (sin θ_v, 0, cos θ_v):
 
     w.x = xx ω.x + xz ω.z,   w.y = ω.y,   w.z = zx ω.x + zz ω.z,   stored (xx, zx, xz, zz), as the columns of mInv.
 
-These are all the freedom that a lobe even in y has. The public fit spends three: its lobe stands about the mean
-direction of the BRDF, w.z ∝ l̄·ω (scheme "heitz"). Here w.z turns freely too ("free"): the same four numbers, read by
-the same shaders.
+These are all the free parameters of a lobe that is even in y. The published fit uses three of them: its lobe is centred
+on the mean direction of the BRDF, w.z ∝ l̄·ω (scheme "heitz"). Here w.z may turn freely too ("free"): the same four
+numbers, read by the same shaders.
 
-What is minimized and stated is the misplaced energy m = ∫ |f (n·l)/E - p| dω over the sphere, E the albedo: light of
-radiance up to 1 is reflected wrongly by E m/2 at most. 0 is exact, 2 is nothing in common. A fit of the third power of
-the difference, as the public one, sees little of m: its table has .124, and its form can do .114 (64², GGX, Smith).
+The error that is minimized and stated is the misplaced energy m = ∫ |f (n·l)/E - p| dω over the sphere, where E is the
+albedo: light of radiance up to 1 is reflected with an error of at most E m/2. 0 is exact, and at 2 the lobes do not
+overlap. A fit of the third power of the difference, as in the published fit, does not minimize m: its table has .124,
+and its form could reach .114 (64², GGX, Smith).
 """
 
 from __future__ import annotations
@@ -59,7 +60,9 @@ ADOPTED = 0.98
 
 @dataclass(frozen=True)
 class Lobes:
-    """Cells of a BRDF on a device. `rows` are what the kernels of ltc.cl read, with four rows for the matrix."""
+    """Cells of a BRDF on a device. `rows` are the rows that the kernels of ltc.cl read, with four rows for the
+    matrix.
+    """
 
     device: Device
     text: str
@@ -80,7 +83,9 @@ class Lobes:
         return cells
 
     def descend(self, N: np.ndarray, which: np.ndarray, rule: Rule, soft: float) -> np.ndarray:
-        """(19, n) of the kernel `descend` at matrices (4, n) = xx, xz, zx, zz of the cells `which`."""
+        """Return the results (19, n) of the kernel `descend` at matrices N (4, n) = xx, xz, zx, zz of the cells
+        `which`.
+        """
         polar, azimuthal = rule.tables()
         return over_cells(
             self.device,
@@ -99,7 +104,10 @@ class Lobes:
         ).astype(np.float64)
 
     def misplaced(self, N: np.ndarray) -> np.ndarray:
-        """(n,): m of matrices (4, n), by nodes of the lobe itself: not those of the fit. 2 where there is no lobe."""
+        """Return the misplaced energy m, (n,), of matrices N (4, n); 2 where there is no lobe.
+
+        The nodes are those of the lobe itself, not those of the fit.
+        """
         whole = np.isfinite(N).all(0) & (N[0] * N[3] - N[1] * N[2] > 0)
         some = np.flatnonzero(whole)
         polar, azimuthal = (np.stack(gauss(n), 1) for n in EXACT)
@@ -118,10 +126,10 @@ class Lobes:
 
 
 def horizon(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The energy b below the horizon, (n,), of matrices N (4, n), and its gradient (4, n) in δ of N <- (1 + δ) N.
+    """Return the energy b below the horizon, (n,), of matrices N (4, n), and its gradient (4, n).
 
-    The lobe's half u.z > 0 meets the half space ω.z > 0 where m·u > 0, m = N⁻ᵀ z: a cosine lobe cut by a plane through
-    its origin holds (1 + m.z/|m|)/2. A step turns m by -δᵀ m.
+    The gradient is in δ of N <- (1 + δ) N. The lobe's half u.z > 0 meets the half space ω.z > 0 where m·u > 0, m = N⁻ᵀ
+    z: a cosine lobe cut by a plane through its origin holds (1 + m.z/|m|)/2. A step turns m by -δᵀ m.
     """
     xx, _, zx, _ = N
     x, z = -zx, xx  # times 1/det N > 0
@@ -133,8 +141,10 @@ def horizon(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass
 class Fit:
-    """The state of a fit: matrices (4, n), the misplaced energy m (n,) by the current rule, and x and z of the mean
-    direction l̄, (2, n)."""
+    """The state of a fit: matrices (4, n), the misplaced energy m (n,) by the current rule, and the mean direction l̄.
+
+    Of l̄ the x and z are kept, (2, n).
+    """
 
     N: np.ndarray
     m: np.ndarray
@@ -165,9 +175,9 @@ def _moved(N: np.ndarray, step: np.ndarray) -> np.ndarray:
 
 
 def descend(lobes: Lobes, fit: Fit, which: np.ndarray, free: bool, stage: tuple[Rule, float, int]) -> None:
-    """Improve the matrices of the cells `which` in place, by Levenberg-Marquardt steps, all cells at a time.
+    """Improve the matrices of the cells `which` in place, by Levenberg-Marquardt steps on all cells at a time.
 
-    Without `free` the row of w.z keeps its direction: δ.zx = 0.
+    free: False keeps the direction of the row of w.z (δ.zx = 0).
     """
     rule, soft, steps = stage
     kept = np.array([0, 1, 2, 3] if free else [0, 1, 3])
@@ -261,7 +271,10 @@ def _from_neighbours(lobes: Lobes, fit: Fit, shape: tuple[int, ...], width: np.n
 
 
 def fit_lobes(lobes: Lobes, shape: tuple[int, ...], width: np.ndarray, scheme: str) -> Fit:
-    """Fit the matrices (4, n) of all cells of a grid of `shape`. width: (n,) angles of the NDF in radians."""
+    """Fit the matrices of all cells of a grid of `shape`: (4, n).
+
+    width: (n,) angular widths of the NDF in radians. scheme: "free" or "heitz".
+    """
     free = scheme == "free"
     fit, which = _start(lobes, width), np.arange(lobes.count)
     for stage in STAGES:
@@ -274,13 +287,13 @@ def fit_lobes(lobes: Lobes, shape: tuple[int, ...], width: np.ndarray, scheme: s
 
 
 def check(slots: Mapping[str, Chosen]) -> None:
-    """Raise UnsupportedError for an anisotropic NDF: its lobes need a full matrix and a third axis."""
+    """Check that the NDF is isotropic. Lobes of others need a full matrix and a third axis. Raises UnsupportedError."""
     if not slots["ndf"].model.isotropic:
         raise UnsupportedError(f"ltc wants an isotropic ndf; {slots['ndf'].model.name} is anisotropic")
 
 
 def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
-    """Digests of the kernels, for the key of a table."""
+    """Return the digests of the kernels, for the key of a table."""
     models = {slot: slots[slot].model for slot in ("ndf", "masking", "fresnel")}
     pair, both = integral("dfg"), {slot: models[slot] for slot in ("ndf", "masking")}
     closed = own_kernel_of(pair, both)
@@ -294,7 +307,9 @@ def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:
 def lobes_of(
     device: Device, models: Mapping[str, Chosen], albedo: np.ndarray, columns: Mapping[str, Any]
 ) -> tuple[Lobes, np.ndarray]:
-    """The cells of a grid of parameters with known albedos, and the angular widths (n,) of their NDF in radians."""
+    """Return the cells of a grid of parameters with known albedos, and the angular widths (n,) of their NDF in
+    radians.
+    """
     entry, precision = integral("albedo"), finest(device)
     slots = {slot: models[slot] for slot in ("ndf", "masking", "fresnel")}
     grid = grid_of(entry, slots, dict(columns), None)
@@ -311,11 +326,11 @@ def lobes_of(
 
 
 def sphere_form_factor(z: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """The form factor of a sphere cut by the horizon, over that of the whole sphere. [Heitz2016, sec. 6; Snyder1996]
+    """Return the form factor of a sphere cut by the horizon, relative to that of the whole sphere.
 
-    Engines clip a polygon with it, as a sphere of the same vector form factor.
-
-    z: cosine from the normal to the sphere's middle; length: sin² of the angle σ of its radius. Broadcast.
+    z: cosine of the angle from the normal to the sphere's middle. length: sin² of the sphere's angular radius. Both
+    broadcast. Engines clip a polygon with it, as if it were a sphere of the same vector form factor. [Heitz2016, sec.
+    6; Snyder1996]
     """
     z, length = np.broadcast_arrays(np.asarray(z, np.float64), np.asarray(length, np.float64))
     sin_w, sin_s, cos_s = np.sqrt(np.maximum(1 - z * z, 0)), np.sqrt(length), np.sqrt(np.maximum(1 - length, 0))
@@ -356,7 +371,10 @@ def _four(values: np.ndarray) -> np.ndarray:
 def matrices(
     scheme: str, device: Device, models: Mapping[str, Chosen], albedo: np.ndarray, columns: Mapping[str, Any]
 ) -> tuple[np.ndarray, Lobes]:
-    """The fitted matrices (4, …), float64, as xx, xz, zx, zz over the broadcast parameters, and their cells."""
+    """Return the fitted matrices (4, …), float64, as xx, xz, zx, zz over the broadcast parameters, and their cells.
+
+    scheme: "free" or "heitz". albedo: (n,) albedos of the cells.
+    """
     lobes, width = lobes_of(device, models, albedo, columns)
     fit = fit_lobes(lobes, np.shape(albedo), width, scheme)
     return fit.N.reshape(4, *np.shape(albedo)), lobes
@@ -379,13 +397,13 @@ def ltc(
     middle: Mapping[str, Any] | None = None,
     **columns: Any,
 ) -> tuple[Integrated, dict[str, Any]]:
-    """The channels `names` of a table, (…, c), and what is stated of it if `report`.
+    """Compute the channels `names` of a table, (…, c), and with `report` the facts that its manifest states.
 
     ltc_1 holds the matrix, ltc_2 (norm, Fresnel, 0, sphere), ltc both.
 
-    norm and Fresnel are ∫ f (n·l) dω with F = 1 and with F = (1 - v·h)⁵, so that a light of radiance 1 over the polygon
-    P is seen as (F0 norm + (1 - F0) Fresnel) ∫_P p dω. The sphere's table is over axes of its own: x is the cosine from
-    -1 to 1, y the length of the vector form factor.
+    norm and Fresnel are ∫ f (n·l) dω with F = 1 and with F = (1 - v·h)⁵, so the radiance that a polygon P of radiance 1
+    causes is (F0 norm + (1 - F0) Fresnel) ∫_P p dω. The sphere's table has axes of its own: x is the cosine from -1 to
+    1, y the length of the vector form factor.
     """
     start = time.perf_counter()
     models = {"ndf": ndf, "masking": masking, "fresnel": fresnel}

@@ -1,4 +1,4 @@
-"""Tables as files: an array over a grid of parameters, with a manifest beside it that proves it whole."""
+"""Writes tables as files: an array over a grid of parameters, with a manifest next to it that proves it complete."""
 
 from __future__ import annotations
 
@@ -45,10 +45,11 @@ Progress = Callable[[str, str, float], None]
 
 @dataclass(frozen=True)
 class Table:
-    """What `lut` did or would do.
+    """The result of `lut`, or its prediction in a dry run.
 
-    state: "done", "skipped" or "planned". manifest: what the manifest states; of a planned table its key and its recipe
-    alone. nbytes: bytes of the array before compression.
+    state     "done", "skipped" or "planned"
+    manifest  the manifest's content; of a planned table only its key and its recipe
+    nbytes    bytes of the array before compression
     """
 
     kind: Kind
@@ -63,13 +64,13 @@ class Table:
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """The part of the manifest that says what was asked for."""
+        """The part of the manifest that describes the request."""
         found: dict[str, Any] = self.manifest.get("recipe", self.manifest)
         return found
 
     @property
     def subject(self) -> str:
-        """What the table is of: its models, or the scheme of a table that has none."""
+        """The subject of the table: its models, or the scheme of a table that has none."""
         return self.kind.subject([c["name"] for c in self.recipe["models"].values()], self.recipe.get("scheme"))
 
 
@@ -167,7 +168,7 @@ def lut(
 def make(
     request: TablePlan, device: Device | str | None = None, *, dry_run: bool = False, progress: Progress | None = None
 ) -> Table:
-    """Make a table as planned, or say what would be done. Raises what `lut` raises."""
+    """Make a table as planned, or in a dry run only describe it. Raises the errors of `lut`."""
     with system_errors(request.path):
         return _make(request, device, dry_run, progress)
 

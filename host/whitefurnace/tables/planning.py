@@ -1,4 +1,4 @@
-"""A request for a table, checked and completed: what will be computed and written, found without a device."""
+"""Checks and completes the request for a table, without a device: it decides what will be computed and written."""
 
 from __future__ import annotations
 
@@ -45,8 +45,9 @@ OPTIONS = frozenset(inspect.signature(integrate).parameters) - {"parameters"}
 class TablePlan:
     """A table that can be made: a request that was checked.
 
-    fit: "bilinear" where texels are fitted for reads between them. as_read: whether the error of such reads is
-    measured. stored: the pixel format of a texture.
+    fit      "bilinear" if texels are fitted for reads between them
+    as_read  True if the error of such reads is measured
+    stored   pixel format of a texture, or None
     """
 
     kind: Kind
@@ -62,21 +63,22 @@ class TablePlan:
 
     @property
     def axes(self) -> tuple[Axis, ...]:
-        """The axes, the fastest, x, first."""
+        """The axes; the first, x, varies fastest."""
         return self.cells.axes
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The shape of the array, […, y, x(, channel)]."""
+        """Shape of the array, […, y, x(, channel)]."""
         return self.spec.shape
 
     @property
     def form(self) -> str:
-        """The suffix of the file, in lower case."""
+        """Suffix of the file, in lower case."""
         return self.path.suffix.lower()
 
     @property
     def dtype(self) -> np.dtype[Any]:
+        """Type of the array's values: float32 or float64."""
         return np.dtype(f"f{self.precision // 8}")
 
     @property
@@ -89,7 +91,7 @@ class TablePlan:
         return self.path.with_name(self.path.name + ".json")
 
     def canonical(self) -> dict[str, Any]:
-        """The recipe as data: everything that changes the bytes, and nothing else."""
+        """Return the recipe as data: everything that changes the bytes, and nothing else."""
         cells = self.cells
         return {
             "integral": self.kind.name,
@@ -109,13 +111,13 @@ class TablePlan:
         }
 
     def key(self) -> str:
-        """sha256 over the recipe, the kernels and the version."""
+        """Return the sha256 of the recipe, the kernels and the version."""
         parts = [VERSION, json.dumps(self.canonical(), sort_keys=True), *self.spec.digests]
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
 def plan(request: TableRequest) -> TablePlan:
-    """Check a request and complete it. Raises UsageError, UnsupportedError, and what reading a user's file raises."""
+    """Check a request and complete it. Raises UsageError, UnsupportedError, and the errors of reading a user's file."""
     kind, request = kind_of(request.kind).settled(request)
     scheme = scheme_of(kind, request.scheme)
     path = Path(request.path)

@@ -1,4 +1,4 @@
-"""What a caller asks of a table, before anything of it is checked."""
+"""The options of a table as a caller gives them, before they are checked."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TableRequest:
-    """Every option of a table, with its default; `whitefurnace.lut` says what each means.
+    """Every option of a table with its default; `whitefurnace.lut` documents them.
 
-    `size`, `tolerance` and `scheme` are the kind's own where they are None.
+    Where `size`, `tolerance` or `scheme` is None, the kind's own value is used.
     """
 
     kind: str

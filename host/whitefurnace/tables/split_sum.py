@@ -32,8 +32,9 @@ CHANNELS: Mapping[str, tuple[tuple[str, str], str]] = {
 class SplitSum:
     """The split-sum table of an engine.
 
-    values: (size, size, 2 or 3) float32, row y, column x, as the engine reads them. error: bound of the absolute error
-    of the first two channels. charlie_error: that of the third channel, 0 without one.
+    values         (size, size, 2 or 3) float32, row y, column x, as the engine reads them
+    error          bound on the absolute error of the first two channels
+    charlie_error  bound on that of the third channel, 0 without one
     """
 
     values: np.ndarray
@@ -52,7 +53,7 @@ def laid_out(
     """Compute the pair in a form, […, 2], or with Charlie's albedo as a third channel, and the error of that channel.
 
     form: a key of `CHANNELS`. pair: arguments of `integrate` for the pair. cloth: those for Charlie's albedo, or None
-    where it is no channel; its tolerance is at least `CHARLIE`. Raises as `integrate` does.
+    where it is not a channel; its tolerance is at least `CHARLIE`. Raises the errors of `integrate`.
     """
     out = pair.get("out")
     made = integrate("dfg", progress=progress, **{**pair, "out": out if cloth is None else None})
@@ -75,20 +76,23 @@ def laid_out(
 
 
 def charlie(cells: Cells) -> dict[str, Any]:
-    """Charlie's lobe with the masking of a table, and its parameters over the same cells."""
+    """Return Charlie's lobe with the masking of a table, and its parameters over the same cells."""
     models: dict[str, Chosen] = {"ndf": chosen("ndf", "charlie"), "masking": cells.models["masking"]}
     return {**models, **cells.columns_for(models)}
 
 
 def axis_values(name: str, spacing: str, size: int) -> np.ndarray:
-    """Parameter values (size,) of the texels of an axis: (k + ½)/size, or (k/(size - 1))² for NoV spaced by "sqrt"."""
+    """Return the parameter values (size,) of the texels of an axis.
+
+    They are (k + ½)/size, or (k/(size - 1))² for NoV spaced by "sqrt".
+    """
     if name == "NoV" and spacing == "sqrt":
         return (np.arange(size) / max(size - 1, 1)) ** 2
     return (np.arange(size) + 0.5) / size
 
 
 def split_sum(table: Dfg, *, device: Device, ndf: Spec = "ggx", masking: Spec = "smith") -> SplitSum:
-    """Compute the split-sum table of an engine, in float32. Raises as `integrate` does."""
+    """Compute the split-sum table of an engine, in float32. Raises the errors of `integrate`."""
     x, y = (axis_values(name, table.NoV, table.size) for name in (table.x, table.y))
     across = {
         table.x: np.broadcast_to(x[None], (table.size, table.size)),

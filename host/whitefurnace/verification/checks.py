@@ -1,4 +1,4 @@
-"""Checks of models, derived from what their catalogue entries state: one row a check, with its worst cell."""
+"""Checks of models, derived from the facts in their catalogue entries: one row for each check, with its worst cell."""
 
 from __future__ import annotations
 
@@ -62,15 +62,15 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class Row:
-    """One check of a model, by the worst of all its cells: the one whose error takes most of its tolerance.
+    """The result of one check of a model at its worst cell, where the error takes the largest share of the tolerance.
 
-    slot, model, check, precision: what was checked.
-    parameters: those of the worst cell.
-    value, expected, error, tolerance: of that cell. `error` is |value - expected|, or where `expected` is a bound, by
-      how much the value exceeds it. `tolerance` is absolute; it is None for what is only measured.
-    passed, cells: the verdict, and how many cells there were.
+    slot, model, check, precision: what was checked; precision is 32 or 64 bits.
+    parameters: parameters of the worst cell.
+    value, expected, error, tolerance: numbers of that cell. `error` is |value - expected|; if `expected` is a bound, it
+    is the amount by which the value exceeds it. `tolerance` is absolute; it is None for a value that is only measured.
+    passed, cells: the verdict, and the number of cells.
     note: a remark for readers.
-    counterexample: repeats a failed cell with its directions.
+    counterexample: the failed cell with its directions, as text.
     """
 
     slot: str
@@ -90,7 +90,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Subject:
-    """A model and the parameters that it is verified at. Those that are not `given` run over their domain."""
+    """A model and the parameters at which it is verified. Those that are not `given` run over their domain."""
 
     model: Model
     label: str
@@ -101,9 +101,9 @@ class Subject:
 
 
 def subjects(specs: Sequence[str]) -> list[Subject]:
-    """Return the models of `specs` (`ggx`, `ggx:alpha=.3`, `FILE.clh:p=v`), or every entry of the catalogue for none.
+    """Return the models of `specs` (`ggx`, `ggx:alpha=.3`, `FILE.clh:p=v`), or the whole catalogue where it is empty.
 
-    Raises UsageError for an unknown name, with the nearest, and for parameters that a file leaves open.
+    Raises UsageError for an unknown name, with the nearest, and for parameters without a value in a file's model.
     """
     entries = [entry for slot in SLOTS for entry in models(slot).values()]
     if not specs:
@@ -153,7 +153,7 @@ def verify(
 ) -> Iterator[Row]:
     """Run all checks of every subject in each precision, one after the other, and yield their rows.
 
-    Raises UnsupportedError for float64 on a device without it, and what a user's file is refused for.
+    Raises UnsupportedError for float64 on a device without it, and the errors of a user's file.
     """
     order = [(subject, precision) for subject in asked for precision in precisions]
     if not device.fp64 and any(precision == 64 for _, precision in order):
@@ -202,17 +202,17 @@ def _drawn(p: Parameter, u: np.ndarray) -> np.ndarray:
 
 
 class Bench:
-    """One model in one precision on one device, with the means to check it."""
+    """One model in one precision on one device, with functions to check it."""
 
     def __init__(self, subject: Subject, precision: int, device: Device) -> None:
         self.subject, self.model, self.given = subject, subject.model, subject.given
         self.precision, self.device, self.rounding = precision, device, ROUNDING[precision]
 
     def columns(self, values: Callable[[Parameter], np.ndarray] = _typical, draws: int = 0) -> Columns:
-        """Return sets of parameters by name: the product of `values` of each, and `draws` more from all over the
-        domain.
+        """Return sets of parameters by name: the product of `values` of each, and `draws` random sets.
 
-        What is given stays, RGB as three sets.
+        Random sets come from the whole domain. Parameters that are given keep their value; an RGB value becomes three
+        sets.
         """
         free = [p for p in self.model.parameters if p.name not in self.given]
         mesh = np.meshgrid(*[values(p) for p in free], indexing="ij")
@@ -230,12 +230,14 @@ class Bench:
         return {p.name: columns[p.name] for p in self.model.parameters}
 
     def tolerance(self, check: str, usual: Mapping[int, float]) -> float:
-        """Return the tolerance of a check: the entry's own for this precision where it states one, else the usual."""
+        """Return the tolerance of a check: the entry's own for this precision where it states one, otherwise the
+        usual.
+        """
         declared = self.model.checks.tolerance.get(check)
         return float(usual[self.precision] if declared is None else declared[PRECISIONS.index(self.precision)])
 
     def rounded(self, values: Any) -> Any:
-        """Return values as the kernel reads them, in float64."""
+        """Return values in float64 after rounding to the kernel's precision."""
         return np.asarray(values, f"f{self.precision // 8}").astype(np.float64)
 
     def kernel(
@@ -262,7 +264,7 @@ class Bench:
     def integral(self, name: str, tolerance: float, **asked: Any) -> tuple[np.ndarray, float, str]:
         """Return the values of `integrate`, its error and its notices.
 
-        Where it gives up, values are NaN everywhere and the reason takes the place of the notices.
+        If it raises an error, all values are NaN and the reason replaces the notices.
         """
         slots: dict[str, Any] = {self.model.slot: self.model}
         try:
@@ -334,9 +336,9 @@ class Bench:
         )
 
     def measured(self, check: str, value: Any, where: Mapping[str, Any], least: bool = False, note: str = "") -> Row:
-        """Return the row of a value that is stated and not judged: the largest of all cells, or the least.
+        """Return the row of a value that is stated and not judged: the largest of all cells.
 
-        Where all are NaN there is nothing to state, and the check fails.
+        least: True for the smallest of all cells. The check fails if all values are NaN.
         """
         flat = np.asarray(value, np.float64).ravel()
         known = not np.isnan(flat).all()

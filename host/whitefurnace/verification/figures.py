@@ -63,7 +63,7 @@ SLOT_TITLES = {"ndf": "NDF", "masking": "Masking", "fresnel": "Fresnel", "diffus
 
 
 def draw(folder: Path, models: Sequence[Model], rows: Sequence[Row], device: Device) -> list[Path]:
-    """Draw one PNG, `folder`/SLOT_NAME.png, for each model of a slot that has a figure, and return the paths in order.
+    """Draw a PNG `folder`/SLOT_NAME.png for each model of a slot that has a figure, and return the paths in order.
 
     rows: give each figure its verdict and a user's model its parameters. The same models, rows and device give the same
     bytes. Raises UnsupportedError without matplotlib, and FileError where the folder cannot be written.

@@ -15,7 +15,7 @@ from whitefurnace.tables.kind import Kind
 
 @cache
 def kinds() -> dict[str, Kind]:
-    """All kinds by name."""
+    """Return all kinds by name."""
     found: dict[str, Kind] = {}
     for info in pkgutil.iter_modules(__path__):
         here: tuple[Kind, ...] = importlib.import_module(f"{__name__}.{info.name}").KINDS
@@ -24,14 +24,14 @@ def kinds() -> dict[str, Kind]:
 
 
 def kind(name: str) -> Kind:
-    """The kind `name`. Raises UsageError with the nearest name."""
+    """Return the kind called `name`. Raises UsageError with the nearest name."""
     if name not in kinds():
         raise UsageError(f"unknown integral {name!r}{nearest(name, kinds())}")
     return kinds()[name]
 
 
 def scheme_of(one: Kind, given: str | None) -> str | None:
-    """The scheme of a table: the one given, or the kind's default. Raises UsageError."""
+    """Return the scheme of a table: the one given, or the kind's default. Raises UsageError."""
     if given is None or given in one.schemes:
         return given or next(iter(one.schemes), None)
     if one.schemes:
@@ -41,11 +41,11 @@ def scheme_of(one: Kind, given: str | None) -> str | None:
 
 
 def listed() -> str:
-    """The kinds and what each holds, a line each."""
+    """Return the kinds and their summaries as text, one on each line."""
     width = max(map(len, kinds()))
     return "\n".join(f"  {name.ljust(width)}  {one.summary}" for name, one in kinds().items())
 
 
 def schemes_listed() -> str:
-    """The schemes of each kind that has some, in one sentence for help."""
+    """Return the schemes of each kind that has some, in one sentence for help."""
     return "; ".join(f"{one.name}: {', '.join(one.schemes)}" for one in kinds().values() if one.schemes)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SplitSum(OfIntegral):
-    """`engine` is the table that an engine reads, once `--for` has named one."""
+    """The kind `dfg`: split-sum tables. `engine` is the table of the engine that `--for` names, or None."""
 
     engine: Dfg | None = None
 
@@ -54,7 +54,7 @@ class SplitSum(OfIntegral):
 
     @property
     def charlie(self) -> bool:
-        """Whether the table has Charlie's albedo as a third channel."""
+        """True if the table has Charlie's albedo as a third channel."""
         return self.engine is not None and self.engine.charlie
 
     def spec(self, cells: Cells) -> TableSpec:

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 
 class Diffusion(Kind):
+    """The kind `diffusion`: diffuse light on skin and other media by curvature; see `tables.diffusion`."""
+
     name = "diffusion"
     summary = "Diffuse light on skin and other media, by curvature"
     help = (

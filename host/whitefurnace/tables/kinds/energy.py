@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 
 
 class Energy(Kind):
+    """The kind `energy`: the energy that single scattering loses, in the forms of three schemes; see
+    `tables.energy`.
+    """
+
     name = "energy"
     summary = "Energy of multiple scattering, for three ways to restore it"
     help = (

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 
 class FresnelAverage(Kind):
+    """The kind `fresnel_average`: the average of a Fresnel term over the hemisphere; see `tables.energy`."""
+
     name = "fresnel_average"
     summary = "Average of a Fresnel term over the hemisphere"
     help = "The axis is the first parameter of the Fresnel model that has no value: f0 for schlick."

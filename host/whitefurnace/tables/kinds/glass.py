@@ -1,4 +1,4 @@
-"""Tables of rough glass: what a boundary of two insulators reflects and lets through."""
+"""Tables of rough glass: the shares of light that a boundary of two insulators reflects and transmits."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 
 class Glass(Kind):
+    """The kind `glass`: the light that a rough boundary reflects and transmits; see `tables.glass`."""
+
     name = "glass"
     summary = "Light that a rough boundary reflects and transmits"
     help = (

@@ -1,4 +1,4 @@
-"""Tables of the integrals of the catalogue themselves: what `whitefurnace.integrate` gives, over a grid."""
+"""Tables of the integrals of the catalogue themselves: the values of `whitefurnace.integrate` over a grid."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class OfIntegral(Kind):
-    """A table of the integral of its own name, of any BRDF that the integral takes."""
+    """A kind that tabulates the integral of its own name, for any BRDF that the integral takes."""
 
     def integral(self, scheme: str | None) -> str:
         return self.name
@@ -56,7 +56,7 @@ class OfIntegral(Kind):
 
 @dataclass(frozen=True)
 class Plain(OfIntegral):
-    """A table of one integral."""
+    """A kind for one integral without further settings."""
 
     name: str
     summary: str

@@ -20,7 +20,10 @@ _NAMES = ("xx", "zx", "xz", "zz", "norm", "fresnel", "0", "sphere")
 
 @dataclass(frozen=True)
 class Ltc(Kind):
-    """`names` are its channels. What is fitted is the BRDF, not the reads between texels."""
+    """The kinds `ltc`, `ltc_1` and `ltc_2`: linearly transformed cosines, with the channels `names`.
+
+    The matrices are fitted to the BRDF, not to reads between texels.
+    """
 
     name: str
     summary: str

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 
 class Norm(Kind):
+    """The kind `norm`: a polynomial for the norm of an NDF, as C and GLSL; see `tables.curves`."""
+
     name = "norm"
     summary = "Fitted polynomial for the norm of an NDF, as C and GLSL"
     help = "Of abc, shifted_gamma or a .clh file, over one or two of its parameters. The tolerance is relative."

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 
 class Radiance(OfIntegral):
+    """The kind `radiance`: light that a surface reflects from a light source or an environment."""
+
     name = "radiance"
     summary = "Light reflected from a light source or an environment"
     help = "Needs --light or --environment; of an environment the table has the channels R, G and B."

@@ -12,6 +12,8 @@ if TYPE_CHECKING:
 
 
 class Sheen(Kind):
+    """The kind `sheen`: the albedo of a sheen and its average; see `tables.energy`."""
+
     name = "sheen"
     summary = "Albedo of a sheen, for scaling the layer below"
     help = "The channels are the directional albedo E(v) and its average E_avg, of a sheen of colour 1."

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 
 class Smith(Kind):
+    """The kind `smith`: a rational function for Smith's term of any NDF, as C and GLSL; see `tables.curves`."""
+
     name = "smith"
     summary = "Fitted curve for Smith's masking of any NDF, as C and GLSL"
     help = "Fitted over NoV and one parameter. `rational` fits a width and a bend, `linear` the width alone."
