@@ -57,6 +57,19 @@ class PartialError(WhitefurnaceError):
     exit_code = 8
 
 
+class InternalError(WhitefurnaceError):
+    """A fault of this package itself."""
+
+    exit_code = 70
+
+
+def code_of(error: BaseException) -> int:
+    """Return the exit code for an exception: its own, that of `FileError` for the system's, else `InternalError`'s."""
+    if isinstance(error, WhitefurnaceError):
+        return error.exit_code
+    return (FileError if isinstance(error, OSError | MemoryError) else InternalError).exit_code
+
+
 def of_code(code: int) -> type[WhitefurnaceError] | None:
     """Return the class of errors with an exit code, or None."""
     return next((kind for kind in WhitefurnaceError.__subclasses__() if kind.exit_code == code), None)

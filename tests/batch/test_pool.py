@@ -180,12 +180,12 @@ def where(request) -> dict[str, object]:
 
 def test_a_failing_item_fails_alone_and_every_item_has_one_result(where):
     acts = {
-        "raise prepare": ("RuntimeError: prepare broke", 2),
-        "raise compute": ("RuntimeError: compute broke", 2),
-        "raise write": ("RuntimeError: write broke", 2),
+        "raise prepare": ("RuntimeError: prepare broke", 70),
+        "raise compute": ("RuntimeError: compute broke", 70),
+        "raise write": ("RuntimeError: write broke", 70),
         "ours compute": ("a tolerance was missed in compute", 7),
-        "unpicklable prepare": ("Unpicklable: it holds a lock", 2),
-        "unpicklable compute": ("Unpicklable: it holds a lock", 2),
+        "unpicklable prepare": ("Unpicklable: it holds a lock", 70),
+        "unpicklable compute": ("Unpicklable: it holds a lock", 70),
     }
     jobs = [Job(f"good {k}") for k in range(5)] + [Job(act, act) for act in acts]
     jobs += [Job("there", "skip")] + [Job(f"more {k}") for k in range(5)]

@@ -27,7 +27,7 @@ from whitefurnace.baking import bake as baking
 from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import pool
 from whitefurnace.catalogue.choice import file_of
-from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, nearest
+from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, code_of, nearest
 from whitefurnace.files import FileOutput, FolderOutput, digest_file, is_lock, is_safe, locks_in, write_text
 from whitefurnace.opencl.device import device_address
 from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
@@ -715,7 +715,7 @@ def _failure(item: Item, error: Exception) -> Result:
         return failed(item, "there is not enough memory for this; a smaller input or size is needed")
     if isinstance(error, OSError):
         return failed(item, f"cannot use {error.filename or item.output}: {error.strerror or error}")
-    return failed(item, f"{type(error).__name__}: {error}")
+    return failed(item, f"{type(error).__name__}: {error}", code_of(error))
 
 
 def prepare(item: Item) -> Prepared | Result:

@@ -25,7 +25,7 @@ from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import Any
 
-from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError
+from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError, code_of
 from whitefurnace.opencl.device import core_limit, cores
 from whitefurnace.version import VERSION
 
@@ -43,6 +43,7 @@ FIRST = 8
 FIRST_SECONDS = 30.0
 CONNECT_SECONDS = 10  # time for a scheduler to answer
 TICK = 0.1  # seconds between two checks for events that send no message: Ctrl-C, a lost scheduler
+ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 PATIENCE = 3.0  # seconds that a stage may take to end after the second Ctrl-C, before its process is killed
 
 
@@ -164,11 +165,6 @@ def _message(error: BaseException) -> str:
     return text if isinstance(error, WhitefurnaceError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
 
 
-def _code(error: BaseException) -> int:
-    """Return the exit code for an exception."""
-    return error.exit_code if isinstance(error, WhitefurnaceError) else FileError.exit_code
-
-
 # ---------------------------------------------------------------------------------------------- in a process
 
 
@@ -201,9 +197,9 @@ class Pipeline:
         """
         reader = threading.Thread(target=self._read, name="read", daemon=True)
         writer = threading.Thread(target=self._write, name="write", daemon=True)
-        reader.start()
-        writer.start()
-        try:
+        try:  # a signal may come while a thread starts
+            reader.start()
+            writer.start()
             while True:
                 try:
                     job = self._ahead.get(timeout=TICK)
@@ -231,7 +227,7 @@ class Pipeline:
                 idle()
             idle()
         except BaseException:
-            self._close(writer)
+            self._close(reader, writer)
             raise
         if self._failure is not None:
             raise self._failure
@@ -243,7 +239,7 @@ class Pipeline:
         except Exception as error:  # it fails this item alone
             if stage is not self._stages.prepare:
                 self._undo(value)
-            given = self._stages.failed(item, _message(error), _code(error))
+            given = self._stages.failed(item, _message(error), code_of(error))
         with self._lock:
             if not isinstance(given, self._stages.result) and not self._closed.is_set():
                 self._held[ticket] = given
@@ -294,14 +290,17 @@ class Pipeline:
         with contextlib.suppress(Exception):
             self._stages.abandon(value)
 
-    def _close(self, writer: threading.Thread) -> None:
-        """Let the item that is being written end, and abandon the others."""
+    def _close(self, *threads: threading.Thread) -> None:
+        """Abandon what waits, and let the items that are being read and written end: they hold locks and files."""
         with self._lock:
             self._closed.set()
             held, self._held = list(self._held.values()), {}
         for value in held:
             self._undo(value)
-        writer.join(PATIENCE)
+        deadline = time.monotonic() + PATIENCE
+        for thread in threads:
+            if thread.ident is not None:  # it was started
+                thread.join(max(deadline - time.monotonic(), 0))
 
 
 def _here(stages: Stages, items: Iterable[Any], on_result: Callable[[Any], None], interrupts: _Interrupts) -> None:
@@ -330,11 +329,13 @@ def _here(stages: Stages, items: Iterable[Any], on_result: Callable[[Any], None]
 
 
 def _serve(stages: Stages, connection: Connection) -> None:
-    """Run a worker process: request an item whenever one can be read, until the connection closes or SIGTERM comes."""
+    """Run a worker process: request an item whenever one can be read, until the connection closes or a signal comes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # it was blocked while this process started
-    signal.signal(signal.SIGTERM, lambda number, frame: _leave())
+    for number in ENDING:
+        if signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores SIGHUP
+            signal.signal(number, _leave)
     sending = threading.Lock()
     warm = False
 
@@ -392,9 +393,11 @@ class _Marked:
         )
 
 
-def _leave() -> None:
-    """End a worker process after SIGTERM."""
-    raise SystemExit(128 + signal.SIGTERM)
+def _leave(number: int, frame: FrameType | None) -> None:
+    """End a worker process after a signal."""
+    for other in ENDING:  # a second one would stop the cleaning
+        signal.signal(other, signal.SIG_IGN)
+    raise SystemExit(128 + number)
 
 
 class _Worker:
@@ -495,7 +498,7 @@ class _Crew:
                 blob = pickle.dumps((ticket, pickle.dumps(item)))
             except Exception as error:
                 worker.alone = False
-                self._result(self.stages.failed(item, f"the item cannot be sent: {_message(error)}", _code(error)))
+                self._result(self.stages.failed(item, f"the item cannot be sent: {_message(error)}", code_of(error)))
                 continue
             worker.items[ticket] = item
             worker.wants = False
@@ -646,7 +649,7 @@ def _do(stages: Stages, item: Any, version: str) -> Any:
     try:
         pickle.dumps(result)
     except Exception as error:
-        return stages.failed(item, f"its result cannot be sent: {_message(error)}", _code(error))
+        return stages.failed(item, f"its result cannot be sent: {_message(error)}", code_of(error))
     return result
 
 
@@ -815,7 +818,7 @@ class _Cluster:
         except Exception as error:
             if self.client.status != "running":
                 raise self._gone() from error
-            self._result(self.stages.failed(item, f"the item cannot be sent: {_message(error)}", _code(error)))
+            self._result(self.stages.failed(item, f"the item cannot be sent: {_message(error)}", code_of(error)))
             return
         self.flying[future] = item
         future.add_done_callback(self.landed.put)

@@ -40,6 +40,7 @@ class Command(click.Command):
     def __init__(self, name: str | None, *, task: Task, **attributes: Any) -> None:
         super().__init__(name, **attributes)
         self.task = task
+        debug()(self)
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write a definition list for each heading, in the order in which the options are declared."""
@@ -55,8 +56,26 @@ class Command(click.Command):
                 formatter.write_dl(records)
 
 
+class NoReader(Exception):
+    """The reader of stdout went away."""
+
+
 class Group(click.Group):
-    """A group whose help lists the commands by task."""
+    """A group whose help lists the commands by task. A broken pipe is `NoReader`: click would exit with code 1."""
+
+    def make_context(self, *given: Any, **options: Any) -> click.Context:
+        """Parse the command line, which may print help or a version."""
+        try:
+            return super().make_context(*given, **options)
+        except BrokenPipeError as error:
+            raise NoReader from error
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command."""
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError as error:
+            raise NoReader from error
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write a definition list for each task of `TASKS`: the name of every command and its summary."""
@@ -243,6 +262,17 @@ def as_json() -> Decorator:
         is_flag=True,
         heading=RUNNING,
         help="Print the results as JSON Lines on stdout, and nothing else there.",
+    )
+
+
+def debug() -> Decorator:
+    """An option of every command. It has no value: what ends a command looks for it in the command line."""
+    return option(
+        "--debug",
+        heading=RUNNING,
+        is_flag=True,
+        expose_value=False,
+        help="Print the traceback of an error before its sentence.",
     )
 
 

@@ -378,6 +378,11 @@ def choose_device(name: str | None = None) -> Device:
     )
 
 
+def identities_in_use() -> list[dict[str, str]]:
+    """Return the identity of each device that was chosen in this process. No driver is called."""
+    return [device.identity() for device in _chosen.values()]
+
+
 def device_address(name: str | None = None) -> str:
     """Return a name by which another process of this machine finds the device that `choose_device(name)` returns.
 
