@@ -15,7 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from mutations import STRUCTURED
 from reference import cube_directions
 from whitefurnace import environment
 from whitefurnace.cli import main
@@ -27,6 +29,7 @@ from whitefurnace.files import (
     read_npy,
     read_npz,
     write_exr,
+    write_hdr,
     write_manifest,
     write_npz,
     write_texture,
@@ -35,6 +38,7 @@ from whitefurnace.files.codec import encode
 from whitefurnace.files.env import EnvMap, write_env
 from whitefurnace.files.gltf_lights import GltfLight, write_gltf_lights
 from whitefurnace.files.packing import step
+from whitefurnace.files.png import encode_png
 from whitefurnace.files.texture import text_value
 from whitefurnace.inspection.contents import contents, described, looks_like, statistics
 from whitefurnace.sphere import harmonics as harmonic
@@ -338,7 +342,12 @@ def seeds(folder: Path) -> list[Path]:
     (folder / "t.h").write_text(
         "// a table\nstatic const float t[2][3] = {\n{1.0f, .5f, 2e-1f},\n{1.0f, 2.0f, 3.0f},\n};\n"
     )
-    return [*found, *(folder / name for name in ("a.npz", "b.npz", "a.npy", "m.json", "a.exr", "sh.txt", "t.h"))]
+    codes = np.arange(96, dtype=np.uint8).reshape(4, 8, 3)
+    (folder / "a.png").write_bytes(encode_png(codes))
+    write_hdr(folder / "a.hdr", codes / 8)
+    Image.fromarray(codes).save(folder / "a.tif")
+    named = ("a.npz", "b.npz", "a.npy", "m.json", "a.exr", "sh.txt", "t.h", "a.png", "a.hdr", "a.tif")
+    return [*found, *(folder / name for name in named)]
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
@@ -367,7 +376,9 @@ def fuzzed(folder: Path, count: int, seed: int) -> int:
     for number in range(count):
         name, data = files[number % len(files)]
         path = where / name
-        path.write_bytes(mutated(data, rng))
+        # Half of the images are changed in what they state, with checksums and offsets that are right.
+        structured = STRUCTURED.get(path.suffix)
+        path.write_bytes(structured(data, rng) if structured and rng.random() < 0.5 else mutated(data, rng))
         try:
             row = described(contents(path))
         except (InputError, UnsupportedError) as error:

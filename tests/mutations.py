@@ -1,0 +1,230 @@
+"""Structured mutations of image files for the fuzz test: the container stays whole, what it states does not.
+
+Checksums, offsets and lengths are right, so that a mutated file reaches the code behind them.
+"""
+
+from __future__ import annotations
+
+import random
+import struct
+import zlib
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def _number(rng: random.Random) -> int:
+    return rng.choice((0, 1, 2, 3, 255, 45455, 65535, 100000, 1 << 31, (1 << 32) - 1, rng.randrange(1 << 32)))
+
+
+# --- ICC -------------------------------------------------------------------------------------------------
+
+
+def icc(rng: random.Random) -> bytes:
+    """A profile of the matrix or grey kind, with some of its parts changed."""
+
+    def fixed(*values: float) -> bytes:
+        return struct.pack(f">{len(values)}i", *(round(65536 * value) for value in values))
+
+    def curve() -> bytes:
+        if rng.random() < 0.5:
+            count = rng.choice((0, 1, 2, 3, 64))
+            stated = count if rng.random() < 0.8 else _number(rng)
+            return b"curv" + bytes(4) + struct.pack(">I", stated) + rng.randbytes(2 * count)
+        kind = rng.choice((0, 1, 2, 3, 4, 4, 5, 9))
+        values = [rng.choice((0.0, 1.0, 2.2, -1.0, 0.1, rng.uniform(-3, 3))) for _ in range(rng.choice((7, 7, 7, 3)))]
+        return b"para" + bytes(4) + struct.pack(">HH", kind, 0) + fixed(*values)
+
+    def colorant(*xyz: float) -> bytes:
+        shift = rng.choice((0, 0, 0, 0, rng.uniform(-2, 2)))
+        return b"XYZ " + bytes(4) + fixed(*(value + shift for value in xyz))
+
+    grey = rng.random() < 0.2
+    tags = {b"kTRC": curve()} if grey else {b"rTRC": curve(), b"gTRC": curve(), b"bTRC": curve()}
+    if not grey:
+        tags[b"rXYZ"] = colorant(0.4361, 0.2225, 0.0139)
+        tags[b"gXYZ"] = colorant(0.3851, 0.7169, 0.0971)
+        tags[b"bXYZ"] = colorant(0.1431, 0.0606, 0.7141)
+    tags[b"desc"] = rng.choice((b"desc", b"mluc")) + bytes(4) + rng.randbytes(rng.randrange(40))
+    if rng.random() < 0.1:
+        tags[rng.choice((b"A2B0", b"cicp", b"D2B0"))] = b"cicp" + bytes(4) + bytes((rng.randrange(20), 16, 0, 1))
+    for name in [name for name in tags if rng.random() < 0.05]:
+        del tags[name]
+    head = bytearray(128)
+    head[8] = rng.choice((2, 4, 4, 5))
+    head[12:16] = rng.choice((b"mntr", b"mntr", b"scnr", b"link"))
+    head[16:20] = b"GRAY" if grey else rng.choice((b"RGB ", b"RGB ", b"RGB ", b"CMYK", b"Lab "))
+    head[20:24] = rng.choice((b"XYZ ", b"XYZ ", b"XYZ ", b"Lab "))
+    head[36:40] = b"acsp"
+    at, table, body = 132 + 12 * len(tags), b"", b""
+    for name, data in tags.items():
+        offset = at + len(body) if rng.random() < 0.98 else _number(rng)
+        table += struct.pack(">4sII", name, offset, len(data) if rng.random() < 0.98 else _number(rng))
+        body += data
+    head[:4] = struct.pack(">I", at + len(body) if rng.random() < 0.95 else _number(rng))
+    count = len(tags) if rng.random() < 0.97 else _number(rng)
+    out = bytes(head) + struct.pack(">I", count) + table + body
+    return out if rng.random() < 0.95 else out[: rng.randrange(len(out))]
+
+
+# --- PNG -------------------------------------------------------------------------------------------------
+
+
+def _statement(rng: random.Random) -> tuple[bytes, bytes]:
+    """A chunk that says something about the pixels."""
+    kind = rng.choice(
+        (b"cICP", b"iCCP", b"gAMA", b"cHRM", b"sRGB", b"acTL", b"pHYs", b"eXIf", b"tRNS", b"sBIT", b"mDCV")
+    )
+    if kind == b"cICP":
+        body = bytes(rng.choice((0, 1, 4, 8, 9, 12, 13, 16, 18, rng.randrange(256))) for _ in range(2))
+        body += rng.choice((b"\0\1", b"\0\0", rng.randbytes(2)))
+    elif kind == b"iCCP":
+        packed = zlib.compress(icc(rng))
+        body = (
+            rng.choice((b"name\0\0", b"\0\0", b"name\0\1", b"n" * 80 + b"\0\0")) if rng.random() < 0.1 else b"name\0\0"
+        )
+        body += packed if rng.random() < 0.9 else packed[: rng.randrange(len(packed))]
+    elif kind == b"gAMA":
+        body = struct.pack(">I", _number(rng))
+    elif kind == b"cHRM":
+        body = struct.pack(
+            ">8I", *(rng.choice((31270, 32900, 64000, rng.randrange(100000), _number(rng))) for _ in range(8))
+        )
+    elif kind == b"acTL":
+        body = struct.pack(">II", _number(rng), 0)
+    elif kind == b"pHYs":
+        body = struct.pack(">IIB", *rng.choice(((1, 1, 0), (_number(rng), _number(rng), rng.randrange(3)))))
+    elif kind == b"eXIf":
+        body = b"II*\0\x08\0\0\0\1\0" + struct.pack("<HHII", 0x112, 3, 1, rng.choice((*range(10), 65535))) + bytes(4)
+    else:
+        body = rng.randbytes({b"sRGB": 1, b"tRNS": 6, b"sBIT": 3, b"mDCV": 24}[kind])
+    return kind, body if rng.random() < 0.95 else body[: rng.randrange(len(body) + 1)]
+
+
+def png(data: bytes, rng: random.Random) -> bytes:
+    chunks, at = [], 8
+    while at < len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        chunks.append((data[at + 4 : at + 8], data[at + 8 : at + 8 + length]))
+        at += 12 + length
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        action, place = rng.randrange(10), rng.randrange(len(chunks))
+        if action < 6:
+            chunks.insert(rng.choice((1, 1, 1, place)), _statement(rng))
+        elif action == 6:
+            chunks.insert(place, chunks[place])
+        elif action == 7 and len(chunks) > 1:
+            del chunks[place]
+        elif action == 8:
+            head = bytearray(chunks[0][1])
+            if len(head) == 13:
+                head[rng.choice((8, 9, 12))] = rng.choice((0, 1, 2, 3, 4, 6, 8, 16))
+            chunks[0] = chunks[0][0], bytes(head)
+        else:
+            kind, body = chunks[place]
+            chunks[place] = kind, body[: rng.randrange(len(body) + 1)]
+    return PNG_SIGNATURE + b"".join(chunk(kind, body) for kind, body in chunks)
+
+
+# --- Radiance --------------------------------------------------------------------------------------------
+
+
+def hdr(data: bytes, rng: random.Random) -> bytes:
+    """Another header for the pixels of a picture, which keep their code or become random."""
+    end = data.index(b"\n\n") + 2
+    stop = data.index(b"\n", end) + 1
+    pixels = data[stop:]
+
+    def number() -> str:
+        return rng.choice(
+            ("1", "0.5", " 2e0", "0", "-1", "nan", "inf", "1e300", "1e-300", "", "x", "1 1", "\t3\v", "0x1p3")
+        )
+
+    def line() -> str:
+        name = rng.choice(("EXPOSURE", "COLORCORR", "GAMMA", "PIXASPECT", "PRIMARIES", "FORMAT", "VIEW", "\tEXPOSURE"))
+        if name == "FORMAT":
+            return "FORMAT=" + rng.choice(("32-bit_rle_rgbe", "32-bit_rle_xyze", "32-bit_rle_rgbe ", "", "\x00"))
+        count = {"COLORCORR": 3, "PRIMARIES": 8}.get(name, 1)
+        if name == "PRIMARIES" and rng.random() < 0.5:
+            return f"PRIMARIES=.64 .33 .3 .6 .15 .06 .3127 {rng.choice(('.329', '0', '1', '-.3'))}"
+        return f"{name}={' '.join(number() for _ in range(rng.choice((count, count, count, 1, 9))))}"
+
+    lines = ["FORMAT=32-bit_rle_rgbe"] * (rng.random() < 0.9) + [line() for _ in range(rng.randrange(4))]
+    axes = [rng.choice("+-") + axis for axis in rng.choice(("YX", "YX", "XY", "YY"))]
+    sizes = [rng.choice((4, 8, 24, 0, 1, 1 << 20, (1 << 31) - 1)) if rng.random() < 0.2 else k for k in (4, 8)]
+    order = data[end:stop] if rng.random() < 0.3 else f"{axes[0]} {sizes[0]} {axes[1]} {sizes[1]}\n".encode()
+    if rng.random() < 0.3:
+        pixels = b"".join(
+            rng.choice((bytes((1, 1, 1, rng.choice((1, 3, 255)))), rng.randbytes(4)))
+            for _ in range(rng.randrange(1, 64))
+        )
+    text = "\n".join(["#?RADIANCE", *rng.sample(lines, len(lines)), "", ""]).encode("latin-1")
+    return rng.choice((text, text, text, text.replace(b"\n", b"\r\n"))) + order + pixels
+
+
+# --- TIFF ------------------------------------------------------------------------------------------------
+
+_SIZES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "II", 7: "B", 9: "i", 11: "f", 12: "d"}
+_TAGS = (254, 256, 257, 258, 259, 262, 266, 273, 274, 277, 278, 279, 282, 283, 284, 291, 301, 317, 318, 319, 320, 338)
+_MORE_TAGS = (339, 529, 530, 532, 32995, 34675, 37439)
+
+
+def tif(data: bytes, rng: random.Random) -> bytes:
+    """Rewrites the first directory of a little-endian TIFF, with tags changed, added, left out or repeated."""
+    (at,) = struct.unpack_from("<I", data, 4)
+    (count,) = struct.unpack_from("<H", data, at)
+    tags = {}
+    for k in range(count):
+        tag, kind, number, value = struct.unpack_from("<HHI4s", data, at + 2 + 12 * k)
+        tags[tag] = kind, number, value
+    out = bytearray(data)
+
+    def stored(kind: int, values: list[float]) -> tuple[int, int, bytes]:
+        form = _SIZES[kind]
+        flat = [v for v in values for _ in form]
+        whole = form[0] not in "fd"
+        low, high = {"B": (0, 255), "H": (0, 65535), "I": (0, (1 << 32) - 1), "i": (-(1 << 31), (1 << 31) - 1)}.get(
+            form[0], (0, 0)
+        )
+        packed = struct.pack(f"<{len(flat)}{form[0]}", *(min(max(int(v), low), high) if whole else v for v in flat))
+        if len(packed) > 4:
+            out.extend(packed)
+            packed = struct.pack("<I", len(out) - len(packed))
+        return kind, len(values), packed.ljust(4, b"\0")
+
+    for _ in range(rng.choice((1, 1, 2, 3))):
+        tag = rng.choice((*_TAGS, *_MORE_TAGS))
+        if tag in tags and rng.random() < 0.15:
+            del tags[tag]
+        elif tag == 34675:
+            tags[tag] = stored(7, list(icc(rng)))
+        elif tag == 301:
+            tags[tag] = stored(3, [rng.randrange(65536) for _ in range(rng.choice((256, 768, 3, 0)))])
+        elif tag in tags and rng.random() < 0.3:
+            kind, number, value = tags[tag]
+            tags[tag] = rng.choice(
+                ((rng.randrange(20), number, value), (kind, _number(rng), value), (kind, number, rng.randbytes(4)))
+            )
+        else:
+            kind = rng.choice((3, 3, 4, 5, 11, 12, 1))
+            values = [rng.choice((0, 1, 2, 3, 4, 5, 6, 8, 16, 32, 32844, 32845, 34676, _number(rng)))] * rng.choice(
+                (1, 1, 2, 3, 6)
+            )
+            tags[tag] = stored(kind, values)
+    if rng.random() < 0.1:  # a circle, or a second page
+        following = rng.choice((at, 8, _number(rng)))
+    else:
+        following = 0
+    out.extend(bytes(len(out) % 2))
+    struct.pack_into("<I", out, 4, len(out))
+    entries = b"".join(
+        struct.pack("<HHI", tag, kind, number) + value for tag, (kind, number, value) in sorted(tags.items())
+    )
+    return bytes(out) + struct.pack("<H", len(tags)) + entries + struct.pack("<I", following)
+
+
+STRUCTURED = {".png": png, ".hdr": hdr, ".tif": tif}
+"""The mutation of each suffix; files of others are mutated byte by byte."""
