@@ -210,9 +210,10 @@ def add_legend(axes: Axes, title: str = "", inside: str | tuple[float, float] | 
             else {
                 "loc": "upper left",
                 "borderaxespad": 0,
+                # Half a disc ends at .75 of the height.
                 "bbox_to_anchor": (1 + 0.12 * inch, 0.75 if axes.name == "polar" else 1.0),
             }
-        )  # half a disc ends at .75
+        )
         legend = axes.legend(handles, labels, title=title or None, alignment="left", **place)
         legend.get_title().set_color("0.35")
 

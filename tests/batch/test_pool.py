@@ -439,9 +439,10 @@ def _script(folder: Path, call: str) -> subprocess.Popen[str]:
     """
     path = folder / "script.py"
     path.write_text(textwrap.dedent(text))
+    # It gets a process group of its own, since a terminal sends Ctrl-C to a whole group.
     return subprocess.Popen(
         [sys.executable, str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )  # a group of its own: a terminal's Ctrl-C goes to all of one
+    )
 
 
 def _children(pid: int) -> list[int]:

@@ -334,8 +334,8 @@ def test_dds_byte_for_byte():
         b"DDS "
         + words(124)
         + words(0x1 | 0x2 | 0x4 | 0x8 | 0x1000 | 0x20000)  # CAPS HEIGHT WIDTH PITCH PIXELFORMAT MIPMAPCOUNT
-        + words(2, 2, 16, 0, 2)
-        + bytes(44)  # height, width, pitch, depth, levels, reserved
+        + words(2, 2, 16, 0, 2)  # height, width, pitch, depth, levels
+        + bytes(44)  # reserved
         + words(32, 0x4)
         + b"DX10"
         + bytes(20)

@@ -83,8 +83,8 @@ def test_anterpolation_has_its_order(device: Device, source: tuple[int, ...], al
     pairs = [
         (math.log(a / b) / math.log(y / x))
         for (a, b), (x, y) in zip(itertools.pairwise(errors), itertools.pairwise(nodes), strict=True)
-        if b > 3e-7
-    ]  # float32 ends there
+        if b > 3e-7  # float32 ends there
+    ]
     # RATE is what plans scale grids by; ORDER is the limit, which 2 nodes a lobe width are not. With stencils of 4
     # points no doubling falls faster than by the fourth power.
     assert pairs and plan.RATE - 1 <= max(pairs) <= constants.ORDER + 1, (alpha, source, errors, pairs)
