@@ -81,7 +81,8 @@ def fit(terms: list[np.ndarray], seconds: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(np.stack(terms, 1) / seconds[:, None], np.ones(len(seconds)), rcond=None)[0]
 
 
-def main() -> None:
+def arguments() -> argparse.Namespace:
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--items", type=int, nargs="+", default=[1, 30, 100])
     parser.add_argument("--sizes", type=int, nargs="+", default=[64, 128, 256], help="sizes of the faces of the probes")
@@ -89,7 +90,11 @@ def main() -> None:
     parser.add_argument("--tolerance", type=float, default=1e-3)
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--predict", type=int, default=10_000)
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = arguments()
     usual = 128 if 128 in options.sizes else options.sizes[0]
     most = max(options.items)
     head = [
@@ -142,6 +147,19 @@ def main() -> None:
     widths = [max(len(row[k]) for row in [head, *rows]) for k in range(len(head))]
     for row in [head, *rows]:
         print("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)))
+    print_fits(points, options, usual)
+    print(
+        f"{os.cpu_count()} cores; wall / stages: over all computing, or all reading and writing, of a worker; wall / "
+        f"kernels: over the kernels' own time, or all reading and writing"
+    )
+
+
+def print_fits(points: list[tuple[bool, int, int, float, float]], options: argparse.Namespace, usual: int) -> None:
+    """Print what an item costs by the runs with one worker, and what many items would cost.
+
+    points: whether the faces are of the usual size, items, bytes read, CPU seconds and wall seconds of each run. usual:
+    that size.
+    """
     table = np.array([point[1:] for point in points])
     alike = np.array([point[0] for point in points])
     ones, items, nbytes = np.ones(len(table)), table[:, 0], table[:, 1]
@@ -159,10 +177,6 @@ def main() -> None:
     print(
         f"wall, one worker, {usual}²: {fixed:.2f} s + {each * 1e3:.1f} ms per item; {options.predict} items: "
         f"{fixed + options.predict * each:.0f} s"
-    )
-    print(
-        f"{os.cpu_count()} cores; wall / stages: over all computing, or all reading and writing, of a worker; wall / "
-        f"kernels: over the kernels' own time, or all reading and writing"
     )
 
 

@@ -94,12 +94,17 @@ def built(device: Device, text: str, precision: int, launch: Callable[[Kernel], 
     return kernel, time.process_time() - begin
 
 
-def main() -> None:
+def arguments() -> argparse.Namespace:
+    """Parse the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-n", "--runs", type=int, default=15)
     parser.add_argument("--outputs", type=int, default=2048, help="directions that the lobe is evaluated in")
     parser.add_argument("--precision", type=int, choices=(32, 64), default=32)
-    options = parser.parse_args()
+    return parser.parse_args()
+
+
+def main() -> None:
+    options = arguments()
     device, precision = choose_device(), options.precision
     kind = np.dtype(f"f{precision // 8}")
     lanes = device.lanes(precision)

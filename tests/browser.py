@@ -17,7 +17,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -62,6 +62,17 @@ class Answer:
 
     about: dict[str, Any] = field(default_factory=dict)
     images: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def started(url: str, profile: str, out: IO[bytes]) -> subprocess.Popen[bytes]:
+    """Start a browser with its own folder `profile`, whose messages go to `out`. Raises OSError."""
+    return subprocess.Popen(
+        [chromium() or CHROMIUM[0], *FLAGS, f"--user-data-dir={profile}", "--enable-logging=stderr", url],
+        stdin=subprocess.DEVNULL,
+        stdout=out,
+        stderr=out,
+        start_new_session=True,
+    )
 
 
 def rendered(
@@ -119,13 +130,7 @@ def rendered(
         with log.open("wb") as out:
             url = f"http://127.0.0.1:{server.server_port}/pages/{page}.html"
             try:
-                browser = subprocess.Popen(
-                    [chromium() or CHROMIUM[0], *FLAGS, f"--user-data-dir={profile}", "--enable-logging=stderr", url],
-                    stdin=subprocess.DEVNULL,
-                    stdout=out,
-                    stderr=out,
-                    start_new_session=True,
-                )
+                browser = started(url, profile, out)
             except OSError as error:
                 server.shutdown()
                 server.server_close()

@@ -201,12 +201,7 @@ def needs(scene: Scene, engine: Engine, *, background: bool = False) -> Needs:
 
     background: True if the environment itself is visible behind the scene.
     """
-    full = chain(
-        lods=engine.lods,
-        usual_min=engine.min_size,
-        size=engine.size,
-        **({"levels": engine.levels} if engine.levels else {}),
-    )  # type: ignore[arg-type]
+    full = chain(lods=engine.lods, usual_min=engine.min_size, size=engine.size, levels=engine.levels or None)
     return _Deciding(scene, engine, full, background).made()
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -104,7 +104,7 @@ class Baked:
     """
 
     name: str
-    state: str
+    state: Literal["done", "skipped", "planned"]
     files: tuple[Path, ...]
     manifest: dict[str, Any]
     plan: tuple[tuple[tuple[str, ...], LevelPlan], ...]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 from whitefurnace.prefiltering.recipe import CERTIFIED
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from whitefurnace.catalogue.choice import Spec
     from whitefurnace.sphere.environments import Environment
 
-    Source = str | os.PathLike[str] | np.ndarray | Environment
+    Source: TypeAlias = str | os.PathLike[str] | np.ndarray | Environment
 
 
 @dataclass(frozen=True)

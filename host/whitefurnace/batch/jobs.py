@@ -865,7 +865,7 @@ def _of_baked(item: Item, baked: baking.Baked, seconds: dict[str, float]) -> Res
         item.place,
         item.name,
         baked.state,
-        item.output,  # type: ignore[arg-type]
+        item.output,
         str(Path(item.output, f"{item.name}.json")),
         seconds,
         sum(files.values()),
@@ -883,7 +883,7 @@ def _of_table(item: Item, table: tables.Table, seconds: dict[str, float]) -> Res
         item.place,
         item.name,
         table.state,
-        item.output,  # type: ignore[arg-type]
+        item.output,
         f"{item.output}.json",
         seconds,
         nbytes,

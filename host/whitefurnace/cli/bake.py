@@ -218,13 +218,16 @@ def bake(
                     _print_failure(name, error, as_json)
             else:
                 print_baked(baked, output, as_json, quiet)
-    if len(planned.names) == 1 and failures:
+    _raise_failures(failures, len(planned.names))
+
+
+def _raise_failures(failures: list[WhitefurnaceError], count: int) -> None:
+    """Raise the error of the only environment, or one error that says how many of `count` environments failed."""
+    if count == 1 and failures:
         raise failures[0]
     if failures:
-        alike = len({type(error) for error in failures}) == 1 and len(failures) == len(planned.names)
-        raise (type(failures[0]) if alike else PartialError)(
-            f"{len(failures)} of {len(planned.names)} environments failed"
-        )
+        alike = len({type(error) for error in failures}) == 1 and len(failures) == count
+        raise (type(failures[0]) if alike else PartialError)(f"{len(failures)} of {count} environments failed")
 
 
 def _print_failure(name: str, error: WhitefurnaceError, as_json: bool) -> None:

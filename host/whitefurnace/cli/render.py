@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +16,9 @@ from whitefurnace.text import table
 if TYPE_CHECKING:
     from whitefurnace.rendering.shading import Rendered
     from whitefurnace.rendering.side_by_side import Rendered as SideBySide
+
+TRUTH_ALONE = ("tolerance", "certify", "multiscatter", "ndf", "dielectric", "metal", "diffuse", "light", "device")
+"""Options that are refused without --truth, in the order in which they are looked for."""
 
 EPILOG = """\b
 Examples:
@@ -180,19 +184,7 @@ def render(
     """Draw a grid of spheres, or the materials of a scene, from the files that were baked for an engine, shaded as that
     engine does. With --truth, draw the full reflectance integral beside it."""
     if truth is None:
-        for name, given in (
-            ("tolerance", tolerance is not None),
-            ("certify", certify is not None),
-            ("multiscatter", multiscatter),
-            ("ndf", ndf is not None),
-            ("dielectric", dielectric is not None),
-            ("metal", metal is not None),
-            ("diffuse", diffuse is not None),
-            ("light", bool(light)),
-            ("device", device is not None),
-        ):
-            if given:
-                raise UsageError(f"--{name} is of the truth: give the image of the bake as --truth ENV")
+        _refuse_options_of_the_truth(click.get_current_context().params)
         from whitefurnace.rendering import shading
 
         made = shading.render(
@@ -244,6 +236,14 @@ def render(
     for notice in made.notices:
         say(f"notice: {made.engine}: {notice}")
     click.echo(text)
+
+
+def _refuse_options_of_the_truth(given: Mapping[str, Any]) -> None:
+    """Raise UsageError for an option that only --truth has. given: the values of all options by name."""
+    for name in TRUTH_ALONE:
+        # An option that is not given has one of these values; 0 is given, though it equals False.
+        if not (given[name] is None or given[name] is False or given[name] == ()):
+            raise UsageError(f"--{name} is of the truth: give the image of the bake as --truth ENV")
 
 
 def rendered_row(made: Rendered) -> dict[str, Any]:

@@ -77,37 +77,19 @@ def integrate(
     Raises UsageError for unknown names and values outside their domain, UnsupportedError for a combination that no rule
     serves, DeviceError where no device works, and what `environment` raises.
     """
-    models: dict[str, Any] = {
-        "ndf": ndf,
-        "masking": masking,
-        "fresnel": fresnel,
-        "diffuse": diffuse,
-        "brdf": brdf,
-        "precision": precision,
-        "tolerance": tolerance,
-        "backfacing": backfacing,
-        "device": device,
-        "out": out,
-        "progress": progress,
-    }
+    models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf}
+    accuracy: dict[str, Any] = {"precision": precision, "tolerance": tolerance, "backfacing": backfacing}
+    course: dict[str, Any] = {"device": device, "out": out, "progress": progress}
+    lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
     if name != "radiance":
-        lit = {"light": light, "environment": environment, "normal": normal}
         wrong = [key for key, value in lit.items() if value is not None]
         if wrong:
             raise UsageError(f"integral {name} has no {wrong[0]}; integral radiance has")
-        return run.integrate(name, **models, **parameters)
+        return run.integrate(name, **models, **accuracy, **course, **parameters)
     from whitefurnace.integrals.radiance import radiance
 
-    return radiance(
-        light=light,
-        environment=environment,
-        normal=normal,
-        rotate=rotate,
-        exposure=exposure,
-        nonfinite=nonfinite,
-        **models,
-        **parameters,
-    )
+    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite}
+    return radiance(**lit, **reading, **models, **accuracy, **course, **parameters)
 
 
 __all__ = ["integrate"]

@@ -265,6 +265,31 @@ def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = 
     return min_size
 
 
+def _ndf_of_roughness(ndf: Spec) -> Chosen:
+    """Return an isotropic NDF that follows roughness, with all other parameters given as one number.
+
+    Raises UnsupportedError for an NDF that is anisotropic or has no roughness, UsageError for its parameters.
+    """
+    choice = chosen("ndf", ndf)
+    name = choice.model.name
+    if not choice.model.isotropic:
+        raise UnsupportedError(f"ndf {name} is anisotropic; only isotropic NDFs can be prefiltered")
+    if choice.model.from_roughness is None:
+        raise UnsupportedError(f"ndf {name} has no parameter that follows roughness")
+    smooth, rough = choice.model.from_roughness(0.3), choice.model.from_roughness(0.7)
+    follows = {p for p in rough if rough[p] != smooth[p]}  # the rest are defaults and can be given
+    for given in choice.given:
+        if given in follows:
+            raise UsageError(f"ndf {name}: {given} follows the roughness of each level and cannot be given")
+    if any(isinstance(value, tuple) for value in choice.given.values()):
+        raise UsageError(f"ndf {name}: a chain takes one number a parameter, not three")
+    wanted = [p.name for p in choice.model.parameters if p.default is None]
+    missing = [p for p in wanted if p not in rough and p not in choice.given]
+    if missing:
+        raise UsageError(f"ndf {name}: {', '.join(missing)} must be given, as {name}:{missing[0]}=VALUE")
+    return choice
+
+
 def chain(
     *,
     ndf: Spec = "ggx",
@@ -293,27 +318,7 @@ def chain(
     bad tolerance or name, and samples out of range or together with a tolerance; UnsupportedError for an NDF that
     cannot be prefiltered because it is anisotropic or has no roughness.
     """
-    choice = chosen("ndf", ndf)
-    if not choice.model.isotropic:
-        raise UnsupportedError(f"ndf {choice.model.name} is anisotropic; only isotropic NDFs can be prefiltered")
-    if choice.model.from_roughness is None:
-        raise UnsupportedError(f"ndf {choice.model.name} has no parameter that follows roughness")
-    smooth, rough = choice.model.from_roughness(0.3), choice.model.from_roughness(0.7)
-    follows = {name for name in rough if rough[name] != smooth[name]}  # the rest are defaults and can be given
-    for name in choice.given:
-        if name in follows:
-            raise UsageError(f"ndf {choice.model.name}: {name} follows the roughness of each level and cannot be given")
-    if any(isinstance(value, tuple) for value in choice.given.values()):
-        raise UsageError(f"ndf {choice.model.name}: a chain takes one number a parameter, not three")
-    missing = [
-        p.name
-        for p in choice.model.parameters
-        if p.name not in rough and p.name not in choice.given and p.default is None
-    ]
-    if missing:
-        raise UsageError(
-            f"ndf {choice.model.name}: {', '.join(missing)} must be given, as {choice.model.name}:{missing[0]}=VALUE"
-        )
+    choice = _ndf_of_roughness(ndf)
     if fit is not None and fit not in FITS:
         raise UsageError(f"unknown fit {fit!r}{nearest(fit, FITS)}")
     size = _power_of_two(size, "size")

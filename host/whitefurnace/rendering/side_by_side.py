@@ -338,14 +338,16 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
     written = shading.dictionary(read_manifest(Path(manifest)))
     recipe, source = shading.dictionary(written.get("recipe")), shading.dictionary(written.get("source"))
     item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
-    turn, exposure = recipe.get("rotate"), recipe.get("exposure")
-    for name, value in (("rotate", turn), ("exposure", exposure)):
+    told: dict[str, float] = {}
+    for name in ("rotate", "exposure"):
+        value = recipe.get(name)
         if not isinstance(value, (int, float)):
             raise InputError(f"{manifest} tells no {name}: it is not the manifest of a bake")
+        told[name] = float(value)
     found = environment(
         item,
-        rotate=float(turn),
-        exposure=float(exposure),  # type: ignore[arg-type]
+        rotate=told["rotate"],
+        exposure=told["exposure"],
         nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse",
     )
     if found.digest != source.get("sha256"):
@@ -513,24 +515,8 @@ def render(
 
     Raises their errors, and UnsupportedError for a PNG without matplotlib.
     """
-    output = Path(output)
-    if output.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"{output} is no name of a picture: it must end with {' or '.join(SUFFIXES)}")
-    low, high = TOLERANCE_RANGE
-    bound = TOLERANCE if tolerance is None else float(tolerance)
-    if not low <= bound <= high:
-        raise UsageError(f"tolerance {bound:g} is outside [{low:g}, {high:g}]")
-    if not 0 <= certify <= 1000:
-        raise UsageError(f"certify {certify} is outside [0, 1000]")
-    if not -shading.EXPOSURES <= exposure <= shading.EXPOSURES:
-        raise UsageError(f"exposure {exposure:g} is outside [{-shading.EXPOSURES:g}, {shading.EXPOSURES:g}]")
-    if output.exists() and not force:
-        raise FileError(f"{output} exists; --force replaces it")
-    if output.suffix.lower() == ".png":
-        from whitefurnace import plot_style
-        from whitefurnace.rendering.figures import draw_side_by_side
-
-        plot_style.require()
+    output, bound = Path(output), TOLERANCE if tolerance is None else float(tolerance)
+    _check(output, bound, certify, exposure, force)
     engine, folder, stem = shading.engine_in(manifest, for_)
     lights = shading.read_lights(engine, folder, stem)
     for name, spec in (("dielectric", dielectric), ("metal", metal)):
@@ -555,19 +541,61 @@ def render(
         further=further,
         progress=progress,
     )
-    scale = scale_of(shown)
-    notices = [*lights.notices, *env.notices, *spheres.notices]
-    if further:
+    made = _rendered(output, exposure, bound, multiscatter, engine, lights, env, spheres, shown, lit=bool(further))
+    _write(made, shown)
+    return made
+
+
+def _check(output: Path, tolerance: float, certify: int, exposure: float, force: bool) -> None:
+    """Raise UsageError for numbers outside their ranges, and the errors of a picture that cannot be written."""
+    if output.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"{output} is no name of a picture: it must end with {' or '.join(SUFFIXES)}")
+    low, high = TOLERANCE_RANGE
+    if not low <= tolerance <= high:
+        raise UsageError(f"tolerance {tolerance:g} is outside [{low:g}, {high:g}]")
+    if not 0 <= certify <= 1000:
+        raise UsageError(f"certify {certify} is outside [0, 1000]")
+    if not -shading.EXPOSURES <= exposure <= shading.EXPOSURES:
+        raise UsageError(f"exposure {exposure:g} is outside [{-shading.EXPOSURES:g}, {shading.EXPOSURES:g}]")
+    if output.exists() and not force:
+        raise FileError(f"{output} exists; --force replaces it")
+    if output.suffix.lower() == ".png":
+        from whitefurnace import plot_style
+
+        plot_style.require()
+
+
+def _notices(shown: Shown, tolerance: float, lit: bool) -> list[str]:
+    """Return notices for lights besides the environment (`lit`) and for a missed tolerance."""
+    notices = []
+    if lit:
         notices.append(
             "what lights besides the environment add is the same in both pictures: what differs is the environment's"
         )
-    missed = [f"{r:.3g}" for r, e in zip(shown.roughness, shown.estimates, strict=True) if e > bound]
+    missed = [f"{r:.3g}" for r, e in zip(shown.roughness, shown.estimates, strict=True) if e > tolerance]
     if missed:
         notices.append(
-            f"the tolerance of {bound:g} is missed at roughness {', '.join(missed)}: "
+            f"the tolerance of {tolerance:g} is missed at roughness {', '.join(missed)}: "
             f"{max(shown.estimates):.2g} after {max(shown.samples)} samples a pixel"
         )
-    made = Rendered(
+    return notices
+
+
+def _rendered(
+    output: Path,
+    exposure: float,
+    tolerance: float,
+    multiscatter: bool,
+    engine: Engine,
+    lights: Lights,
+    env: Environment,
+    spheres: SphereLayout,
+    shown: Shown,
+    *,
+    lit: bool,
+) -> Rendered:
+    """Return the record of the pictures. lit: whether there are lights besides the environment."""
+    return Rendered(
         output,
         engine.name,
         shown.engine.shape[1],
@@ -576,10 +604,10 @@ def render(
         spheres.metalness,
         exposure,
         lights.read,
-        tuple(notices),
+        (*lights.notices, *env.notices, *spheres.notices, *_notices(shown, tolerance, lit)),
         spheres.placed(),
         env.digest,
-        bound,
+        tolerance,
         shown.samples,
         shown.estimates,
         shown.certificate,
@@ -587,28 +615,33 @@ def render(
         shown.within(0.5),
         shown.within(MOST),
         multiscatter,
-        scale,
+        scale_of(shown),
         shown.seconds,
     )
-    if output.suffix.lower() == ".exr":
+
+
+def _write(made: Rendered, shown: Shown) -> None:
+    """Write the pictures as the layers of an EXR, or as the panels of a PNG."""
+    if made.path.suffix.lower() == ".exr":
         layers = ("difference", "engine", "truth")  # the order in which readers list them
         write_exr(
-            output,
+            made.path,
             np.concatenate([getattr(shown, name) for name in layers], 2).astype(np.float32),
             channel_names=tuple(f"{name}.{c}" for name in layers for c in "RGB"),
             attributes=_stated(made),
         )
     else:
+        from whitefurnace.rendering.figures import draw_side_by_side
+
         draw_side_by_side(
-            output,
-            [shading.srgb(p * 2.0**exposure) for p in (shown.engine, shown.truth)],
+            made.path,
+            [shading.srgb(p * 2.0**made.exposure) for p in (shown.engine, shown.truth)],
             np.where(shown.covered, shown.luminance, np.nan),
-            scale,
-            engine.name,
+            made.scale,
+            made.engine,
             _caption(made),
             {key: str(value) for key, value in _stated(made).items()},
         )
-    return made
 
 
 def _stated(made: Rendered) -> dict[str, str | float | int]:

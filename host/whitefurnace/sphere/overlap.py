@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -551,10 +552,26 @@ def _latlong_from_cube(
     if size % 2 == 0:
         cotangent[size // 2] = 0.0
     cot0, cot1 = cotangent[i], cotangent[i + 1]
-    quarter = math.pi / 4
-    place, low, high, below, above, extra = [], [], [], [], [], []
+    pieces = _Pieces(m)
+    _on_side_faces(pieces, n, phi0, phi1, cot0, cot1)
+    _on_polar_faces(pieces, n, phi0, phi1, cot0, cot1)
+    return pieces.integrated(texels)
+
+
+@dataclass
+class _Pieces:
+    """Pieces of m texels in the planes of source faces, m at a time, as `_regions` takes them."""
+
+    m: int
+    place: list[Ints] = field(default_factory=list)
+    low: list[Floats] = field(default_factory=list)
+    high: list[Floats] = field(default_factory=list)
+    below: list[Floats] = field(default_factory=list)
+    above: list[Floats] = field(default_factory=list)
+    extra: list[Floats] = field(default_factory=list)
 
     def add(
+        self,
         where: Ints,
         s0: Floats,
         s1: Floats,
@@ -562,22 +579,43 @@ def _latlong_from_cube(
         over: list[tuple[Floats, ...]],
         meet: list[Floats],
     ) -> None:
-        place.append(np.broadcast_to(where, (m, 3)))
-        low.append(s0)
-        high.append(s1)
-        below.append(np.stack([np.stack(np.broadcast_arrays(*side), -1) for side in under], 1))
-        above.append(np.stack([np.stack(np.broadcast_arrays(*side), -1) for side in over], 1))
-        extra.append(np.stack(meet, 1))
+        self.place.append(np.broadcast_to(where, (self.m, 3)))
+        self.low.append(s0)
+        self.high.append(s1)
+        self.below.append(np.stack([np.stack(np.broadcast_arrays(*side), -1) for side in under], 1))
+        self.above.append(np.stack([np.stack(np.broadcast_arrays(*side), -1) for side in over], 1))
+        self.extra.append(np.stack(meet, 1))
 
-    zero, one = np.zeros(m), np.ones(m)
-    nothing = np.full(m, np.nan)
+    def integrated(self, texels: npt.NDArray[np.float32]) -> tuple[Floats, Floats]:
+        """Return the integral (m, 3) and the solid angle (m,) of each texel, over all of its pieces."""
+        # Side faces have one side each way: padded with a copy to two, as on ±Y.
+        both = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in self.below]
+        over = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in self.above]
+        meets = [np.pad(x, ((0, 0), (0, 6 - x.shape[1])), constant_values=np.nan) for x in self.extra]
+        sums, area = _regions(
+            texels.reshape(-1, 3),
+            np.concatenate(self.place),
+            np.concatenate(self.low),
+            np.concatenate(self.high),
+            np.concatenate(both),
+            np.concatenate(over),
+            np.concatenate(meets),
+        )
+        return sums.reshape(-1, self.m, 3).sum(0), area.reshape(-1, self.m).sum(0)
+
+
+def _on_side_faces(pieces: _Pieces, n: int, phi0: Floats, phi1: Floats, cot0: Floats, cot1: Floats) -> None:
+    """Add the pieces of lat-long texels on ±X and ±Z: azimuths from phi0 to phi1, cot θ from cot0 down to cot1."""
+    quarter = math.pi / 4
+    zero, one = np.zeros(pieces.m), np.ones(pieces.m)
+    nothing = np.full(pieces.m, np.nan)
     for face, axis in ((0, 0.0), (1, math.pi), (4, math.pi / 2), (5, -math.pi / 2)):
         # A texel spans up to 2π (size 1 is π): it may reach the face from both sides, in separate pieces.
         for turn in range(-2, 3):
             a = np.clip(phi0 - axis + 2 * math.pi * turn, -quarter, quarter)
             b = np.clip(phi1 - axis + 2 * math.pi * turn, -quarter, quarter)
             top, bottom = np.clip(-cot0, -4, 4), np.clip(-cot1, -4, 4)
-            add(
+            pieces.add(
                 _places(n, np.array([face]))[0],
                 np.where(b == quarter, -1.0, -np.tan(b)),
                 np.where(a == -quarter, 1.0, -np.tan(a)),
@@ -585,6 +623,12 @@ def _latlong_from_cube(
                 [(zero, zero, bottom, one, one)],
                 [nothing],
             )
+
+
+def _on_polar_faces(pieces: _Pieces, n: int, phi0: Floats, phi1: Floats, cot0: Floats, cot1: Floats) -> None:
+    """Add the pieces of lat-long texels on ±Y, by octants: azimuths from phi0 to phi1, cot θ from cot0 down to cot1."""
+    quarter = math.pi / 4
+    zero, one = np.zeros(pieces.m), np.ones(pieces.m)
     for south in (False, True):
         near, far = (-cot1, -cot0) if south else (cot0, cot1)  # |cot θ| grows towards the pole
         with np.errstate(divide="ignore"):
@@ -614,7 +658,7 @@ def _latlong_from_cube(
                 top_p = np.where(live, np.minimum(outer * np.sin(b), 1.0), -1.0)
                 meet = [rho * np.sin(angle) for rho in (inner, outer) for angle in (a, b)]
                 meet += [np.tan(a), np.tan(b)]
-                add(
+                pieces.add(
                     np.array([origin, step_s, step_t]),
                     np.where(live, inner * np.sin(a), 0.0),
                     top_p,
@@ -625,17 +669,3 @@ def _latlong_from_cube(
                     ],
                     meet,
                 )
-    # Side faces have one side each way: padded with a copy to two, as on ±Y.
-    both = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in below]
-    over = [np.repeat(side, 2, 1) if side.shape[1] == 1 else side for side in above]
-    meets = [np.pad(x, ((0, 0), (0, 6 - x.shape[1])), constant_values=np.nan) for x in extra]
-    sums, area = _regions(
-        texels.reshape(-1, 3),
-        np.concatenate(place),
-        np.concatenate(low),
-        np.concatenate(high),
-        np.concatenate(both),
-        np.concatenate(over),
-        np.concatenate(meets),
-    )
-    return sums.reshape(-1, m, 3).sum(0), area.reshape(-1, m).sum(0)

@@ -195,6 +195,16 @@ def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, A
     if not report:
         return made, {}
     pair = _pairs(scheme, *curves(held, powers2), c2, A2, x2)
+    return made, _smith_stated(cells, values, error, pair)
+
+
+def _smith_stated(cells: Cells, values: np.ndarray, error: float, pair: float) -> dict[str, Any]:
+    """Return the manifest's facts about a fit of Smith's term, with the text of its header.
+
+    values: the coefficients as written. error: the largest error of G1, pair: of the height-correlated G.
+    """
+    scheme = cells.scheme
+    along = next((axis for axis in cells.axes if axis.name != "NoV"), None)
     name = along.name if along else "x"
     formula = (
         "G1 = c/A, A = c + k (1 - c)"
@@ -203,11 +213,11 @@ def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, A
     )
     span = f"{name} from {along.low:g} to {along.high:g}" if along else "the parameters given"
     lines = [
-        f"Smith's term of {_named(ndf)}, fitted over {span} and all n·v:",
+        f"Smith's term of {_named(cells.models['ndf'])}, fitted over {span} and all n·v:",
         *formula.split("; "),
         f"largest error of G1 {error:.2g}, of the height-correlated G {pair:.2g}",
     ]
-    polynomials = [_horner(values[row].tolist(), name, values.dtype.name) for row in range(shape[0])]
+    polynomials = [_horner(row, name, values.dtype.name) for row in values.tolist()]
     body = [f"#define NAME_K({name}) ({polynomials[0]})"]
     if scheme == "rational":
         body += [
@@ -222,8 +232,8 @@ def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, A
         f"#define NAME_V(NoL, NoV, {name}) (1.0f / ((NoL) * NAME_A(NoV, {name}) + (NoV) * (NAME_A(NoL, {name}) - "
         "(NoL))))",
     ]
-    return made, {
-        "channels": ["k", "q"][: shape[0]],
+    return {
+        "channels": ["k", "q"][: len(values)],
         "formula": formula,
         "error_pairs": pair,
         "variable": name,
@@ -315,17 +325,8 @@ def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, An
     values, error, degree = room_for(shape_of_norm(axes), run.precision, run.out), math.inf, 0
     for degree in DEGREES:
         matrix, kept = basis(at, degree)
-        weights: np.ndarray = np.ones(wanted.size)
-        best, least = np.zeros(len(kept)), math.inf
-        for _ in range(40):  # weights that follow the errors [Lawson1961]
-            numbers = np.linalg.lstsq(matrix * weights[:, None], wanted * weights, rcond=None)[0]
-            off = np.abs(np.expm1(matrix @ numbers - wanted))
-            if off.max() < least:
-                best, least = numbers, float(off.max())
-            weights = np.sqrt(weights**2 * (off / max(off.max(), 1e-300) + 1e-3))
-            weights /= weights.max()
         values[...] = 0
-        for index, coefficient in zip(kept, best, strict=True):
+        for index, coefficient in zip(kept, _lawson(matrix, wanted), strict=True):
             values[index] = coefficient
         held = np.array([values[index] for index in kept], np.float64)
         there, _ = basis(between, degree)
@@ -345,6 +346,31 @@ def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, An
     )
     if not report:
         return made, {}
+    return made, _norm_stated(ndf, spans, values, degree, error)
+
+
+def _lawson(matrix: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Return the coefficients c that make the largest relative error of exp(matrix @ c) against exp(wanted) least.
+
+    matrix: (points, coefficients). The weights of a least-squares fit follow its errors. [Lawson1961]
+    """
+    weights: np.ndarray = np.ones(wanted.size)
+    best, least = np.zeros(matrix.shape[1]), math.inf
+    for _ in range(40):
+        numbers = np.linalg.lstsq(matrix * weights[:, None], wanted * weights, rcond=None)[0]
+        off = np.abs(np.expm1(matrix @ numbers - wanted))
+        if off.max() < least:
+            best, least = numbers, float(off.max())
+        weights = np.sqrt(weights**2 * (off / max(off.max(), 1e-300) + 1e-3))
+        weights /= weights.max()
+    return best
+
+
+def _norm_stated(ndf: Chosen, spans: Sequence[Span], values: np.ndarray, degree: int, error: float) -> dict[str, Any]:
+    """Return the manifest's facts about the fit of a norm, with the text of its header.
+
+    values: the coefficients as written. error: the largest relative error of the norm.
+    """
     kind = values.dtype.name
     names = [span.name.removeprefix("ndf_") for span in spans]
     scaled = [
@@ -358,14 +384,14 @@ def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, An
         f"#define NAME_POLYNOMIAL({', '.join('xy'[: len(names)])}) ({_nested(inner, 'x')})",
         f"#define NAME_NORM({', '.join(names)}) exp(NAME_POLYNOMIAL({', '.join(scaled)}))",
     ]
-    formula = f"D = norm · {LOBES.get(entry.name, 'the lobe')}; ln norm is a polynomial of degree {degree}"
+    formula = f"D = norm · {LOBES.get(ndf.model.name, 'the lobe')}; ln norm is a polynomial of degree {degree}"
     lines = [
         f"The norm of {_named(ndf)} for "
         + ", ".join(f"{n} from {s.low:g} to {s.high:g}" for n, s in zip(names, spans, strict=True))
         + f"; largest relative error {error:.2g}",
         formula,
     ]
-    return made, {
+    return {
         "formula": formula,
         "degree": degree,
         "text": (lines, body),

@@ -92,13 +92,12 @@ def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str
         if report or scheme == "fdez_aguera"
         else None
     )
-    channels = {
-        "kulla_conty": lambda: (lost, lost_avg),
-        "turquin": lambda: (E.values, lost / E.values),
-        "fdez_aguera": lambda: (pairs.values[..., 0], pairs.values[..., 1]),
-    }[scheme]()  # type: ignore[union-attr]
+    if scheme == "fdez_aguera" and pairs is not None:
+        channels, parts = (pairs.values[..., 0], pairs.values[..., 1]), [pairs]
+    else:
+        channels = (lost, lost_avg) if scheme == "kulla_conty" else (E.values, lost / E.values)
+        parts = [E, mean]
     values = _whole(what["out"], channels, what["precision"])
-    parts = [pairs] if scheme == "fdez_aguera" and pairs else [E, mean]
     made = replace(_joined(*parts), values=values)
     # The albedos were asked for more exactly than the table was, and need not have come so far.
     made = replace(made, notices=tuple(missed(made.error, what["tolerance"], what["precision"])))

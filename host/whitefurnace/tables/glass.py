@@ -143,8 +143,13 @@ def glass(
     )
     if not report:
         return made, {}
-    both = flat.sum(1, dtype=np.float64)
-    return made, {
+    return made, _stated(flat, scheme)
+
+
+def _stated(shares: np.ndarray, scheme: str | None) -> dict[str, Any]:
+    """Return the manifest's facts about the shares (cells, 2) of a scheme."""
+    both = shares.sum(1, dtype=np.float64)
+    return {
         "channels": ["reflected", "transmitted"],
         "largest": float(both.max()),
         "least": float(both.min()),

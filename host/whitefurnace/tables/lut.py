@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -54,7 +54,7 @@ class Table:
 
     kind: Kind
     path: Path
-    state: str
+    state: Literal["done", "skipped", "planned"]
     shape: tuple[int, ...]
     axes: tuple[Axis, ...]
     nbytes: int
@@ -135,33 +135,13 @@ def lut(
 
     Raises UsageError, UnsupportedError, FileError, CheckError, DeviceError, and InputError for a bad environment.
     """
-    request = TableRequest(
-        kind,
-        path,
-        size=size,
-        axes=axes,
-        ndf=ndf,
-        masking=masking,
-        fresnel=fresnel,
-        diffuse=diffuse,
-        brdf=brdf,
-        light=light,
-        environment=environment,
-        normal=normal,
-        rotate=rotate,
-        exposure=exposure,
-        nonfinite=nonfinite,
-        backfacing=backfacing,
-        precision=precision,
-        tolerance=tolerance,
-        fit=fit,
-        as_read=as_read,
-        scheme=scheme,
-        stored=stored,
-        for_=for_,
-        force=force,
-        parameters={**(parameters or {}), **fixed},
-    )
+    models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf}
+    lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
+    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite, "backfacing": backfacing}
+    accuracy: dict[str, Any] = {"precision": precision, "tolerance": tolerance, "fit": fit, "as_read": as_read}
+    form: dict[str, Any] = {"size": size, "axes": axes, "scheme": scheme, "stored": stored, "for_": for_}
+    numbers = {**(parameters or {}), **fixed}
+    request = TableRequest(kind, path, **models, **lit, **reading, **accuracy, **form, force=force, parameters=numbers)
     return make(plan(request), device, dry_run=dry_run, progress=progress)
 
 

@@ -485,35 +485,47 @@ def _anisotropic(sheet: _Sheet) -> Page:
 
     around = np.linspace(0, math.pi / 2, 40)
 
-    def shape_error(axes: Axes) -> None:
-        theta = np.radians(np.linspace(0.25, 89.75, 120))
-        m = [_rounded(c) for c in _towards(theta, around[:, None])]
-        own = {name: float(_rounded(value)) for name, value in numbers.items()}
-        got = _evaluate(device, "NDF_D", {"ndf": entry}, m, {"ndf": own})
-        want = entry.reference["D"](np.arctan2(np.hypot(m[0], m[1]), m[2]), np.arctan2(m[1], m[0]), **own)
-        with np.errstate(all="ignore"):
-            error = np.where(want > max(1e-30, 1e-30 * float(want.max())), np.abs(got / want - 1), np.nan)
-        _map(figure, axes, np.degrees(theta), np.degrees(around), error)
-        axes.set(ylabel="φ (degrees)", yticks=[0, 30, 60, 90])
-        axes.set_title(f"Relative error of D: {_largest(error)}", fontsize=11)
-        _degrees(axes, step=30)
-
-    def furnace(axes: Axes) -> None:
-        NoV = np.geomspace(1e-3, 1, 36)
-        got = integrate("weak_furnace", ndf=entry, NoV=NoV, phi=around[::2, None], device=device, **numbers).values
-        error = np.abs(np.asarray(got, np.float64) - 1)
-        _map(figure, axes, NoV, np.degrees(around[::2]), error)
-        axes.set(xscale="log", xlabel="n·v", ylabel="φ (degrees)", yticks=[0, 30, 60, 90])
-        axes.set_title(f"Weak white furnace less 1: {_largest(error)}", fontsize=11)
-
     heat = [Panel(partial(slopes, n, n is sets[-1]), 4.4, 1.1 if n is sets[-1] else 0.3) for n in sets]
     return [
         (4.4, heat),
         (
             3.1,
-            [Panel(masking, 2.8), Panel(albedo, 2.8, 1.25), Panel(shape_error, 2.6, 0.95), Panel(furnace, 2.6, 0.95)],
+            [
+                Panel(masking, 2.8),
+                Panel(albedo, 2.8, 1.25),
+                Panel(partial(_turned_shape_error, sheet, numbers, around), 2.6, 0.95),
+                Panel(partial(_turned_furnace_error, sheet, numbers, around[::2]), 2.6, 0.95),
+            ],
         ),
     ]
+
+
+def _turned_shape_error(sheet: _Sheet, numbers: Numbers, around: np.ndarray, axes: Axes) -> None:
+    """Draw a map of the error of D of an anisotropic NDF, over θ and the azimuths `around` in radians."""
+    entry = sheet.entry
+    theta = np.radians(np.linspace(0.25, 89.75, 120))
+    m = [_rounded(c) for c in _towards(theta, around[:, None])]
+    own = {name: float(_rounded(value)) for name, value in numbers.items()}
+    got = _evaluate(sheet.device, "NDF_D", {"ndf": entry}, m, {"ndf": own})
+    want = entry.reference["D"](np.arctan2(np.hypot(m[0], m[1]), m[2]), np.arctan2(m[1], m[0]), **own)
+    with np.errstate(all="ignore"):
+        error = np.where(want > max(1e-30, 1e-30 * float(want.max())), np.abs(got / want - 1), np.nan)
+    _map(sheet.figure, axes, np.degrees(theta), np.degrees(around), error)
+    axes.set(ylabel="φ (degrees)", yticks=[0, 30, 60, 90])
+    axes.set_title(f"Relative error of D: {_largest(error)}", fontsize=11)
+    _degrees(axes, step=30)
+
+
+def _turned_furnace_error(sheet: _Sheet, numbers: Numbers, around: np.ndarray, axes: Axes) -> None:
+    """Draw a map of the error of the weak white furnace over n·v and the azimuths `around` in radians."""
+    NoV = np.geomspace(1e-3, 1, 36)
+    got = integrate(
+        "weak_furnace", ndf=sheet.entry, NoV=NoV, phi=around[:, None], device=sheet.device, **numbers
+    ).values
+    error = np.abs(np.asarray(got, np.float64) - 1)
+    _map(sheet.figure, axes, NoV, np.degrees(around), error)
+    axes.set(xscale="log", xlabel="n·v", ylabel="φ (degrees)", yticks=[0, 30, 60, 90])
+    axes.set_title(f"Weak white furnace less 1: {_largest(error)}", fontsize=11)
 
 
 DASHED = (0, (4, 2.5))
