@@ -20,7 +20,7 @@ from whitefurnace.sphere.environments import Environment, environment
 def usual(engine: Engine, *, size: int | None = None) -> Chain:
     """Return the chain that is baked for an engine by default.
 
-    size: texels a face edge of level 0, a power of two; None for the engine's own. Raises UsageError for another size.
+    size: face edge of level 0 in texels, a power of two; None for the engine's own. Raises UsageError otherwise.
     """
     return chain(
         size=engine.size if size is None else size,

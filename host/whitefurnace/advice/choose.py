@@ -57,7 +57,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class _Candidate:
-    """One set of files: what the engine's files are, its chain and its bytes before compression."""
+    """One set of files: the description of the engine's files, its chain and its bytes before compression."""
 
     engine: Engine
     recipe: Chain

@@ -293,7 +293,7 @@ class ErrorMeter:
 
     @cached_property
     def _others(self) -> tuple[Entry, ...]:
-        """Effects of choices that another renderer could make, each against the reference."""
+        """Measure the effects of choices that another renderer could make, each against the reference."""
         integrals = self.integrals
         found = []
         if self.engine.bend != "0" or self.engine.blend != "0":

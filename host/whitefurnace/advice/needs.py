@@ -475,7 +475,7 @@ class _Deciding:
         return {"ndf": "charlie", **only, "without": without}
 
     def _effects(self) -> None:
-        """Adds rows for effects of the materials that no table of an environment gives."""
+        """Add rows for effects of the materials that no table of an environment can show."""
 
         def add(what: str, which: Sequence[Material], reason: str) -> None:
             if which:

@@ -105,7 +105,7 @@ def sample_points(scene: Scene, *, least: float = 0.0, count: int = POINTS, seed
 
 
 def _drawn(spread: Spread, count: int, rng: np.random.Generator) -> np.ndarray:
-    """(count,) values of one channel: one value from each of `count` equal parts of its distribution, shuffled."""
+    """Draw (count,) values of one channel: one value from each of `count` equal parts of its distribution, shuffled."""
     low, high, share = np.array(spread.shares).T
     ends = np.concatenate([[0.0], np.cumsum(share) / share.sum()])
     u = (np.arange(count) + rng.random(count)) / count
@@ -115,7 +115,7 @@ def _drawn(spread: Spread, count: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def _insulator(m: Material) -> tuple[np.ndarray, float]:
-    """(3,) F0 by KHR_materials_ior and KHR_materials_specular, and the index of refraction.
+    """Return F0 (3,) by KHR_materials_ior and KHR_materials_specular, and the index of refraction.
 
     The index is 0 where the specular extension changes F0, which an index alone cannot describe.
     """

@@ -55,8 +55,8 @@ class Storage:
 class EngineReads:
     """Values that an engine reads at the points of a scene, and the radiance that it shows.
 
-    Arrays are (m, 3) linear radiance, one row a point, unless stated otherwise. Baked chains, reads and tables are
-    kept, so that sets of files which share a part compute it once.
+    Arrays are linear radiance (m, 3), one row for each point, unless stated otherwise. Baked chains, reads and tables
+    are kept, so that sets of files which share a part compute it once.
     """
 
     def __init__(self, integrals: PointIntegrals, engine: Engine) -> None:

@@ -48,9 +48,9 @@ class Group:
 class PointIntegrals:
     """Integrals of the reflected light at the points of a scene in one environment.
 
-    Arrays are linear radiance (m, 3), one row a point, unless stated otherwise. `right` is the reference against which
-    errors are measured; `accuracy` is the 99th percentile of its own error. Each integral is computed once, on first
-    use.
+    Arrays are linear radiance (m, 3), one row for each point, unless stated otherwise. `right` is the reference against
+    which errors are measured; `accuracy` is the 99th percentile of its own error. Each integral is computed once, on
+    first use.
     """
 
     def __init__(self, scene: Scene, sampled: ScenePoints, env: Environment, device: Device) -> None:
@@ -146,7 +146,7 @@ class PointIntegrals:
 
     @cached_property
     def _lost(self) -> np.ndarray:
-        """(m, 1): 1/E₁ - 1, with E₁ the albedo for F0 = 1."""
+        """1/E₁ - 1, where E₁ is the albedo for F0 = 1, (m, 1)."""
         _, E, _, more = self._once
         return np.asarray(1 / np.maximum(E + more, 1e-6) - 1)
 

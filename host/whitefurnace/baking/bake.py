@@ -240,7 +240,7 @@ def _chain(engine: Engine, request: BakeRequest) -> Chain:
 
 
 def _is_demo(item: Any) -> bool:
-    """Whether a source is the built-in environment: the word `demo`, unless there is a path of that name."""
+    """Return whether a source is the built-in environment: the word `demo`, unless a path of that name exists."""
     return str(item) == DEMO and not os.path.exists(item)
 
 
@@ -276,21 +276,21 @@ def bake(
 
     sources: a path, an array, an `environment`, or a list of them; the word `demo` is the built-in sky.
     output: the folder of all files. They go to `output/ENGINE/STEM…`; the manifest `output/STEM.json` is written last
-        and proves the rest whole. An environment whose manifest has the same key is skipped.
+        and proves that they are complete. An environment whose manifest has the same key is skipped.
     for_: target engines or .toml files of your own, separated by commas.
-    size, min_size: texels a face edge of the first and last level, powers of two from 1 to 2048. levels: their number,
-        1 to 32. only_levels: "A-B", the levels that are made for raw and exr, counted from 0.
-    without: parts of engines' files to leave out, of irradiance, sh, sheen, dfg, skybox. table: texels a side of
+    size, min_size: face edge of the first and last level in texels, powers of two from 1 to 2048. levels: number of
+        levels, 1 to 32. only_levels: "A-B", the levels that are made for raw and exr, counted from 0.
+    without: parts of engines' files to leave out, of irradiance, sh, sheen, dfg, skybox. table: texels per side of
         engines' split-sum tables.
     ndf: an isotropic NDF, by name, path of a .clh file or entry.
     tolerance: bound on the stated error of every level, 1e-5 to .5, 1e-3 by default; or quality "draft" (1e-2),
         "normal" (1e-3), "reference" (2e-5); or samples, 1 to 65536, for filtered importance sampling.
     certify: texels of each level whose error is measured, 299 to 1048576.
     fit: "read" fits the levels to how they are interpolated. as_read: measure the error after the engine's sampling.
-    rotate: degrees about +Y. exposure: stops. nonfinite: "refuse" or "zero". sun: "keep", "extract" or "clamp=X".
+    rotate: degrees about +Y, from +X towards +Z. exposure: stops. nonfinite: "refuse" or "zero". sun: "keep", "extract" or "clamp=X".
     sh: "window=auto", "window=none" or "window=X", the window of engines' irradiance harmonics.
     force: bake again, and replace files that are not known to be ours.
-    device: a `Device`, or a number or part of a name. dry_run: say what would be done, and do nothing.
+    device: a `Device`, or a number or part of a name. dry_run: only return the plan.
     progress: called with the environment's name, the part that is made and the share done.
     Raises UsageError, FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an
     environment that fails.

@@ -173,7 +173,9 @@ def _format_loss(kept: np.ndarray, true: np.ndarray, mean: float) -> dict[str, f
 
 
 def _level_stated(level: Level, kept: np.ndarray, true: np.ndarray) -> dict[str, Any]:
-    """What the manifest says of a level: `true` as computed, `kept` as the format holds it."""
+    """Return the manifest's statements about a level: `true` is the level as computed, `kept` as the format holds
+    it.
+    """
     mean = float(true.astype(np.float64).mean())
     return {
         "size": int(true.shape[-2]),
@@ -209,7 +211,7 @@ def _texture(
     keys: Mapping[str, bytes],
     coverage: Sequence[Level] = (),
 ) -> Encoded:
-    """Cube levels in a pixel format, turned to the engine's axes, with what the format costs each."""
+    """Return cube levels in a pixel format and the engine's axes, with the error that the format adds to each."""
     turned = [turned_cube(level.texels, engine.matrix) for level in levels]
     held: list[np.ndarray] = turned
     if coverage and file.stored in ("rgba16f", "rgba32f"):
@@ -355,7 +357,7 @@ def _attributes(made: Made, more: Mapping[str, str | float] | None = None) -> di
 
 
 def _sh(engine: Engine, made: Made) -> np.ndarray:
-    """(9, 3): the windowed harmonics in the engine's axes and scaling."""
+    """Return the windowed harmonics in the engine's axes and scaling, (9, 3)."""
     assert engine.sh is not None
     scaled = getattr(harmonic, engine.sh)(harmonic.turned(made.window.values, engine.matrix))
     return np.asarray(scaled, np.float64)

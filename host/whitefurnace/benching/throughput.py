@@ -226,7 +226,7 @@ class BenchMeter:
         self._rates: dict[str | int, list[float]] = {}
 
     def _run(self, which: str | int, make: Callable[[], Work]) -> float:
-        """Units of 1e9 a second of one run; the first of all is not counted."""
+        """Return the rate of one run in 1e9 units per second; the first of all runs is not counted."""
         if which not in self._works:
             self._works[which] = make()
             _seconds(self.device, self._works[which])
@@ -305,13 +305,13 @@ def _rng() -> np.random.Generator:
 
 
 def _directions(count: int) -> np.ndarray:
-    """(3, count) unit directions all over the sphere."""
+    """Return unit directions all over the sphere, (3, count)."""
     d = _rng().normal(size=(3, count))
     return d / np.linalg.norm(d, axis=0)
 
 
 def _cells(*ranges: tuple[float, float], count: int) -> np.ndarray:
-    """(rows, count) numbers within their ranges."""
+    """Return cells of random numbers within their ranges, (rows, count)."""
     low, high = np.array(ranges).T
     return low[:, None] + (high - low)[:, None] * _rng().random((len(ranges), count))
 
@@ -356,7 +356,7 @@ def _ggx(device: Device) -> Lobe:
 
 
 def _octahedral(device: Device, precision: int, scale: int) -> Work:
-    """The same lobe over the grid of 64² nodes a face, by the 48 symmetries."""
+    """The same lobe over the grid of 64² nodes per face, by the 48 symmetries."""
     kind, n = np.dtype(f"f{precision // 8}"), 64
     shape, symmetries = Shape(False, min(16 * scale, 1024)), Octahedral(device, precision)
     grid = device.array(_rng().random((6, n, n, 4)).astype(kind))
@@ -399,7 +399,7 @@ def _truth(device: Device, precision: int, scale: int) -> tuple[Truth, Term, Poi
 
 
 def _truth_samples(device: Device, precision: int, scale: int) -> Work:
-    """256 samples a point, each between two levels."""
+    """256 samples per point, each between two levels."""
     truth, found, points = _truth(device, precision, scale)
     count = points.n.shape[1]
     pyramid = truth.rest.pyramid(truth.rest.size)
@@ -431,7 +431,7 @@ def _pyramid(device: Device, precision: int, scale: int) -> Work:
 
 
 def _anterpolate(device: Device, precision: int, scale: int) -> Work:
-    """A lat-long's texels onto the grid of 64² nodes a face."""
+    """A lat-long's texels onto the grid of 64² nodes per face."""
     env = _noise(rows := min(64 * scale, 2048))
     texels = 2.0 * rows**2
     return Work(
@@ -457,7 +457,7 @@ def _apart(device: Device, precision: int, scale: int) -> Work:
 
 
 def _interpolate(device: Device, precision: int, scale: int) -> Work:
-    """A level of a cube from 128² nodes a face."""
+    """A level of a cube from 128² nodes per face."""
     convolver, shape = Convolver(device, _noise(16), precision=precision), Shape(False, min(64 * scale, 1024))
     grid = device.array(_rng().random((6, 128, 128, 4), np.float32))
     level = device.empty((*shape.dims, 3), np.float32)
@@ -475,7 +475,7 @@ def _near_texels(device: Device, precision: int, scale: int) -> Work:
 
 
 def _means(device: Device, precision: int, scale: int) -> Work:
-    """Of a lat-long over the texels of a cube of 128²."""
+    """Return the work of making the means of a lat-long over the texels of a cube of 128²."""
     rows = min(64 * scale, 2048)
     texels = _rng().random((rows, 2 * rows, 3), np.float32)
     return Work(
@@ -487,7 +487,7 @@ def _means(device: Device, precision: int, scale: int) -> Work:
 
 
 def _means_of_cube(device: Device, precision: int, scale: int) -> Work:
-    """Of a turned cube over the texels of another of half its size."""
+    """Return the work of making the means of a rotated cube over the texels of another cube of half its size."""
     size = min(8 * scale, 512)
     texels = _rng().random((6, 2 * size, 2 * size, 3), np.float32)
     return Work(
@@ -679,7 +679,7 @@ def _radiance_texels(device: Device, precision: int, scale: int) -> Work:
 
 
 def _harmonics(device: Device, precision: int, scale: int) -> Work:
-    """Of a list of nodes, to degree 2."""
+    """Return the work of making the harmonics of a list of nodes, to degree 2."""
     kind = np.dtype(f"f{precision // 8}")
     chunks = 16 * scale * device.local_size
     nodes = chunks * HARMONICS_CHUNK

@@ -99,24 +99,24 @@ _LISTED = {
 
 @dataclass(frozen=True)
 class Model:
-    """One model of a slot: all that the engine, the tests and the documents know about it.
+    """One model of a slot: everything that the engine, the tests and the documents know about it.
 
-    slot, name, title: where it belongs, its name on command lines, its name for people.
-    citation: the paper that it is from. `also_cited` are further papers that its kernel file cites.
+    slot, name, title: the slot, the name on command lines, and the name for people.
+    citation: the paper that describes it. also_cited: further papers that its kernel file cites.
     parameters: its parameters, in the order in which kernel functions take them.
-    provides, needs: kernel functions that it has and that it calls on other slots, as SLOT_FUNCTION (`NDF_D`).
+    provides, needs: kernel functions that it has, and those of other slots that it calls, as SLOT_FUNCTION (`NDF_D`).
     reference: float64 references by function name, written in another form than the kernel.
-    isotropic: whether an NDF depends on the polar angle alone.
-    from_roughness: its parameters for a perceptual roughness in [0, 1], in a chain of levels.
-    past_one: the same for roughnesses over 1, which the last mips of some engines have; None where r = 1 is the end.
-    checks: what the engine and the tests act on. notes: further facts, in prose, for readers alone.
-    constants: gives float64 numbers that follow from the parameters alone, such as a norm; kernel functions take them,
-      in the order of `constant_names`, after the parameters.
+    isotropic: True if an NDF depends on the polar angle alone.
+    from_roughness: function from a perceptual roughness in [0, 1] to its parameters, for a chain of levels.
+    past_one: the same for a roughness over 1, which the last mips of some engines have; None where r = 1 is the end.
+    checks: facts that the engine and the tests act on. notes: further facts, in prose, for readers alone.
+    constants: function from the parameters to float64 numbers that depend on them alone, such as a norm. Kernel
+    functions take them after the parameters, in the order of `constant_names`.
     presets: named parameter sets, RGB as three numbers.
-    limits: exact values by name. Each takes the parameters and returns the argument of the reference and its value
-      there, NaN where there is none.
-    text, path, takes_sin2: of a model from a user's file, its kernel text, where the file lies, and whether its D takes
-      sin²θ. Models of the catalogue have a kernel file instead.
+    limits: exact values by name. Each is a function from the parameters to the argument of the reference and its value
+    there, NaN where there is none.
+    text, path, takes_sin2: only for a model from a user's file: its kernel text, the path of the file, and True if its
+    D takes sin²θ. Models of the catalogue have a kernel file instead.
     """
 
     slot: str

@@ -366,7 +366,7 @@ def planned_text(baked: Baked) -> str:
     ]
     lines = [
         f"{baked.name}: would bake, key {baked.manifest['key'][:12]}…",
-        table(["", "size", "r", "source grid a face", "lobe evaluations", "nodes a texel"], rows),
+        table(["", "size", "r", "source grid per face", "lobe evaluations", "nodes per texel"], rows),
     ]
     for path, nbytes in zip(baked.files, baked.nbytes, strict=True):
         lines.append(f"  would write {path}  {size(nbytes)} before compression")

@@ -97,7 +97,7 @@ def _inspected(level: Mapping[str, Any]) -> list[str]:
 
 
 def _stated(statement: Mapping[str, Any] | None) -> list[str]:
-    """Lines with what a manifest or the attributes of whitefurnace state about a file."""
+    """Return lines with the facts that a manifest or the attributes of whitefurnace state about a file."""
     if statement is None:
         return ["  no manifest lists it, and it states no error"]
     lines = []

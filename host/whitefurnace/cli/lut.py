@@ -270,7 +270,7 @@ def table_text(made: Table) -> str:
 
 
 def _stated_lines(made: Table) -> list[str]:
-    """Lines with what a manifest states about a table besides its error."""
+    """Return lines with the facts that a manifest states about a table in addition to its error."""
     m, lines = made.manifest, []
     if "channels" in m:
         lines.append(f"  channels  {', '.join(m['channels'])}")

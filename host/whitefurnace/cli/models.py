@@ -48,7 +48,9 @@ def models_text(entries: Sequence[Model]) -> str:
 
 
 def _domains(entry: Model) -> list[str]:
-    """`NAME [low, high]` for each parameter. The components of a vector of any length are one item, `NAME_x/y/z`."""
+    """Return `NAME [low, high]` for each parameter. A vector's components are one item, `NAME_x/y/z`, whatever their
+    number.
+    """
     found = []
     for p in entry.parameters:
         stem, _, axis = p.name.rpartition("_")

@@ -168,7 +168,7 @@ def scene(
 def _check_options(
     output: Path | None, job: Path | None, environments: tuple[str, ...], tolerance: float | None
 ) -> None:
-    """Raises UsageError for options that exclude each other or miss another one."""
+    """Refuse options that exclude each other or that miss another one. Raises UsageError."""
     if output is not None and job is not None:
         raise UsageError("give -o or --job, not both")
     if (output or job) and not environments:
@@ -186,7 +186,7 @@ def _inside(
     rows: int | None,
     named: tuple[str, ...],
 ) -> tuple[Sequence[Inside], Pixel | None]:
-    """What the media of a scene need at its scale, and the length that a pixel covers."""
+    """Judge the media of a scene at its scale, and return the judgements and the length that a pixel covers."""
     from whitefurnace.scenes import media
 
     covered = media.pixel_of(found, pixel, rows)
@@ -248,7 +248,9 @@ def _bake(
 
 
 def _tabulate(needs: Needs, output: Path, device: str | None, force: bool, as_json: bool, quiet: bool) -> None:
-    """Write the tables that a scene needs beside its bakes. Raises FileError where the folder cannot be made."""
+    """Write the tables that a scene needs in addition to its bakes. Raises FileError where the folder cannot be
+    made.
+    """
     from whitefurnace.tables import lut as tables
     from whitefurnace.tables.axes import named
 

@@ -176,17 +176,17 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
 
     @cached_property
     def bend_formula(self) -> Expression:
-        """`bend` as a formula of r and alpha."""
+        """The formula `bend` of r and alpha."""
         return Expression(self.bend, ("r", "alpha"), f"{self.name}: bend")
 
     @cached_property
     def blend_formula(self) -> Expression:
-        """`blend` as a formula of r and alpha."""
+        """The formula `blend` of r and alpha."""
         return Expression(self.blend, ("r", "alpha"), f"{self.name}: blend")
 
     @cached_property
     def matrix(self) -> tuple[tuple[int, int, int], ...]:
-        """`axes` as a signed permutation P: the stored direction is P · the world's."""
+        """The axes as a signed permutation P: the stored direction is P · the world's."""
         return axes_matrix(self.axes, f"{self.name}: axes")
 
     def holding(self, holds: str) -> tuple[File, ...]:

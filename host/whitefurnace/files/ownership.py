@@ -82,7 +82,7 @@ class Output(ABC):
         return file.is_file() and digest_file(file) in digests
 
     def _ours(self, manifests: Iterable[dict[str, Any] | None]) -> dict[str, list[Any]]:
-        """For each file the sha256 that make it ours."""
+        """Return, for each file, the digests that prove it to be ours."""
         found: dict[str, list[Any]] = {}
         for manifest in filter(None, manifests):
             for name, digest in {**self.kept(manifest), **(self.digests(manifest) or {})}.items():

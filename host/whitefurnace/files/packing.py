@@ -31,7 +31,7 @@ class Format:
     size      bytes of a texel, or of a block
     largest   the largest finite value (for `b10g11r11` of red and green)
     signed    whether negative values can be stored
-    block     texels a side of a block; 1 where the format is not compressed
+    block     texels per side of a block; 1 where the format is not compressed
     """
 
     name: str

@@ -64,7 +64,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _arcs(a: np.ndarray, b: np.ndarray, cell: np.ndarray, keep: np.ndarray) -> Pieces:
-    """Great circles from the directions of a to those of b: what a straight edge looks like."""
+    """Return great circles from the directions a to the directions b: the image of straight edges."""
     a, b = _unit(a), _unit(b)
     normal = np.cross(a, b)
     sine = np.linalg.norm(normal, axis=-1)
@@ -142,13 +142,15 @@ def outline(light: str, numbers: Mapping[str, np.ndarray]) -> Pieces:
 
 @dataclass(frozen=True)
 class _Slopes:
-    """What an outline passes n in: slopes of the half vector in widths of the lobe, or of l itself (no view)."""
+    """The slopes in which an outline passes n: those of the half vector in widths of the lobe, or of l itself (no
+    view).
+    """
 
     view: np.ndarray | None  # (n, 3)
     widths: np.ndarray  # (n, 2)
 
     def of(self, P: np.ndarray) -> np.ndarray:
-        """(..., n, 2) at points P (..., n, 3)."""
+        """Return the slopes at points P (..., n, 3): (..., n, 2)."""
         H = _unit(P)
         if self.view is not None:
             H = H + self.view
@@ -156,7 +158,7 @@ class _Slopes:
 
 
 def _nearest(pieces: Pieces, slopes: _Slopes) -> np.ndarray:
-    """(2, n): where each piece passes n nearest, and next nearest if there are two such places."""
+    """Return where each piece passes n nearest, and next nearest if there are two such places: (2, n)."""
     t = pieces.start + (pieces.end - pieces.start) * SAMPLES[:, None]
     apart = _dot(*2 * (slopes.of(pieces.at(t)),))
     around = np.pad(apart, ((1, 1), (0, 0)), constant_values=np.inf)
@@ -183,7 +185,7 @@ def _scale(pieces: Pieces, slopes: _Slopes, t: np.ndarray) -> np.ndarray:
 
 
 def _crossing(pieces: Pieces, direction: np.ndarray, level: np.ndarray | float = 0.0) -> np.ndarray:
-    """(2, n): where direction·P = level, or the start where it never is."""
+    """Return where direction·P = level, or the start where that never holds: (2, n)."""
     a, b, c = (_dot(direction, x) for x in (pieces.A, pieces.B, pieces.C))
     length = np.hypot(a, b)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -119,7 +119,7 @@ def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
 
 
 def _of_files(parts: Sequence[Part], flat: np.ndarray) -> Iterator[str]:
-    """What a user wants to hear of a model from a file: the norm that was divided out, or the range of its albedo."""
+    """Return notices about models from a file: the norm that was divided out, or the range of the albedo."""
     for part in parts:
         for entry in part.slots.values():
             low, high = part.norms
@@ -578,8 +578,10 @@ def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
 
 
 def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, totals: Totals) -> np.ndarray:
-    """`climb`, by a kernel of its own where there is one for these models, and infinity where a diffuse albedo is
-    infinite at n·v = 0, as its closed form says (Minnaert's)."""
+    """Integrate as `climb` does, or by a kernel that is written for these models.
+
+    The value is infinite where a diffuse albedo is infinite at n·v = 0, as its closed form says (Minnaert's).
+    """
     own_kernel, far = own_kernel_of(part.entry, part.slots), rows[0] >= CLOSED_FROM[0]
     if own_kernel and tolerance >= CLOSED_FROM[1] and far.any():
         values = np.empty((part.components, rows.shape[1]))
@@ -601,7 +603,7 @@ def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, totals: Totals) 
 
 
 def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, totals: Totals) -> np.ndarray:
-    """(components, n): 2∫ E(μ) μ dμ with μ = x² (the grazing end wants nodes), by rules of more and more nodes."""
+    """Return 2∫ E(μ) μ dμ with μ = x², (components, n), by rules of more and more nodes; the grazing end needs many."""
     out = np.empty((part.components, end - begin))
     for some in _slices(begin, end, 512):
         rows = grid.rows(part, *some)

@@ -208,7 +208,7 @@ def _fill(
 
 @dataclass
 class _Task:
-    """What is asked, on which device, and what it has cost so far."""
+    """The request, its device, and the work done so far."""
 
     device: Device
     entry: Integral
@@ -263,7 +263,9 @@ class _Task:
 def _at(
     task: _Task, function: str, slots: Mapping[str, Model], arguments: np.ndarray, begin: int, end: int
 ) -> tuple[np.ndarray, float]:
-    """(components, n): a function of the slots at arguments (rows, n), finest precision; the error of its table."""
+    """Return a function of the slots at arguments (rows, n), (components, n), in the finest precision; and its
+    table's error.
+    """
     part = Part(task.device, integral("albedo"), dict(slots), finest(task.device))
     numbers, terms, error = part.cells(task.grid.rows(part, begin, end), part.precision)
     cells = np.concatenate([arguments, numbers[len(part.view) :]])
@@ -273,7 +275,7 @@ def _at(
 
 
 def _light_at(task: _Task, function: str, direction: np.ndarray, begin: int, end: int) -> np.ndarray:
-    """(n,): LIGHT_L or LIGHT_C at directions (3, n)."""
+    """Return LIGHT_L or LIGHT_C at directions (3, n): (n,)."""
     model = task.slots["light"].model
     cells = np.concatenate([direction, *(v[None] for v in task.light(begin, end).values())])
     return evaluate(task.device, function, {"light": model}, cells, finest(task.device))[0].astype(np.float64)
@@ -292,7 +294,7 @@ def _mirror(task: _Task, begin: int, end: int) -> np.ndarray:
 
 
 def _fresnel(task: _Task, begin: int, end: int) -> np.ndarray:
-    """(1, n): F(v, n)."""
+    """Return F(v, n): (1, n)."""
     model = task.slots["fresnel"].model
     rows = [task.column(f"fresnel_{p.name}", begin, end) for p in model.parameters]
     cells = np.stack([task.column("NoV", begin, end), *rows])
@@ -334,7 +336,7 @@ def _ambient(task: _Task, begin: int, end: int) -> np.ndarray:
 
 
 def _albedo(task: _Task, begin: int, end: int) -> tuple[np.ndarray, float]:
-    """(components, n) directional albedos and their error."""
+    """Return directional albedos (components, n) and their error."""
     if "albedo" not in task.parts:
         brdf = {slot: c for slot, c in task.slots.items() if slot != "light"}
         task.parts["albedo"] = parts_of(task.device, integral("albedo"), brdf, task.precision)
@@ -344,7 +346,7 @@ def _albedo(task: _Task, begin: int, end: int) -> tuple[np.ndarray, float]:
 
 
 def _widths(task: _Task, slots: Mapping[str, Model], begin: int, end: int) -> np.ndarray:
-    """(n, 2) widths of the lobe along x and y; 1 for a diffuse model."""
+    """Return the widths of the lobe along x and y, (n, 2); 1 for a diffuse model."""
     n = end - begin
     if "ndf" not in slots:
         return np.full((n, 2), source.LOBE_WIDTH if "brdf" in slots else 1.0)
@@ -357,8 +359,10 @@ def _widths(task: _Task, slots: Mapping[str, Model], begin: int, end: int) -> np
 
 
 def _blur(widths: np.ndarray, NoV: np.ndarray, precision: int) -> np.ndarray:
-    """(n,): how much of a lobe's width the rounding of half vectors is. Within the lobe |l + v| = 2 v·h is as short as
-    n·v or the lobe's own width, whichever is larger."""
+    """Return the rounding of half vectors relative to the lobe's width, (n,).
+
+    Within the lobe |l + v| = 2 v·h is as short as n·v or the lobe's own width, whichever is larger.
+    """
     width = widths.min(1)
     return np.where(width < 1, SHARP[precision] / (width * np.maximum(NoV, width)), 0.0)
 
@@ -390,7 +394,9 @@ class _Outlined(Part):
         return LADDER
 
     def cells(self, rows: np.ndarray, precision: int, tolerance: float = 0.0) -> tuple[np.ndarray, int, float]:
-        """As of any part; the row before the models' numbers says which cell's panels are meant."""
+        """Return rows as `Part.cells` does; the row before the models' numbers names the cell whose panels are
+        meant.
+        """
         assert self.light is not None
         count = len(self.view)
         numbers = {p.name: rows[2 + k] for k, p in enumerate(self.light.parameters)}
@@ -402,7 +408,7 @@ class _Outlined(Part):
         return found, terms, error
 
     def _panels(self, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Which panels the cells have, and for each of them the index of its cell among these."""
+        """Return the panels of the cells, and for each panel the index of its cell."""
         number = cells[len(self.view) - 1].astype(int)
         first, count = self.starts[number], np.diff(self.starts)[number]
         which = np.repeat(np.arange(len(number)), count)
@@ -561,7 +567,7 @@ class _Texels:
         self.whole = _Turned(task.device, integral("albedo"), dict(task.models), task.precision)
 
     def at(self, direction: np.ndarray) -> np.ndarray:
-        """(3, n): radiance from local directions (3, n), of the texel each falls on."""
+        """Return the radiance of the texels in local directions (3, n): (3, n)."""
         x, y, z = self.frame.T @ direction
         c, s = math.cos(self.env.rotation), math.sin(self.env.rotation)
         x, z = c * x + s * z, c * z - s * x
@@ -601,7 +607,10 @@ class _Texels:
         return self._tables[cuts, precision]
 
     def far(self, cells: np.ndarray, terms: int, cuts: int, precision: int, skip: np.ndarray | None) -> np.ndarray:
-        """(3, n) over all texels but those of `skip`, `cuts` nodes an edge of each, for rows of cells (…, n)."""
+        """Return the sum over all texels except those of `skip`, for cells (…, n): (3, n).
+
+        cuts: nodes per edge of each texel.
+        """
         device = self.task.device
         kind = np.dtype(f"f{precision // 8}")
         real = kind.type
@@ -651,7 +660,7 @@ class _Texels:
         return max(1, min(STEPS, count // (4 * self.task.device.lanes(precision) * self.task.device.local_size)))
 
     def _over(self, listed: Buffer, stride: int, cells: np.ndarray, terms: int, precision: int) -> np.ndarray:
-        """(3, n): the sum over a list of nodes."""
+        """Return the sum over a list of nodes, (3, n)."""
         device = self.task.device
         lanes, n = device.lanes(precision), cells.shape[1]
         steps = next(s for s in range(STEPS, 0, -1) if stride % (s * lanes * device.local_size) == 0)
@@ -676,8 +685,11 @@ class _Texels:
     # ---------------------------------------------------------------------------------- close texels
 
     def close(self, cells: np.ndarray, widths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Texels (faces·rows·columns,) that one view's lobe varies over, and their parts (m, 5) as face, top and left
-        edge, height and width in texels: each small beside its distance from the lobe's middle."""
+        """Return the texels over which one view's lobe varies, and their parts.
+
+        The texels are flags (faces·rows·columns,). The parts (m, 5) are face, top and left edge, height and width in
+        texels; each part is small compared with its distance from the lobe's middle.
+        """
         NoV, phi = max(float(cells[0]), source.LEAST_COSINE), float(cells[1])
         sine = math.sqrt((1 - NoV) * (1 + NoV))
         v = np.array([sine * math.cos(phi), sine * math.sin(phi), NoV])
@@ -720,7 +732,7 @@ class _Texels:
         return (large | (highest - lowest > lowest + turn)) & (highest > 0)
 
     def directions(self, face: np.ndarray, i: np.ndarray, j: np.ndarray) -> np.ndarray:
-        """(3, n) local directions of points in texels: face, row and column, fractions and all."""
+        """Return local directions (3, n) of points in texels, given by face and fractional row and column."""
         if self.latlong:
             theta = i * (math.pi / self.rows)
             phi = j * (2 * math.pi / self.columns) - math.pi
@@ -731,7 +743,10 @@ class _Texels:
         return self.frame @ np.stack([c * d[0] - s * d[2], d[1], s * d[0] + c * d[2]])
 
     def near(self, cell: np.ndarray, terms: int, parts: np.ndarray, edge: int, precision: int) -> np.ndarray:
-        """(3, 1) over parts of texels, `edge` Gauss nodes an edge of each, for one cell (rows, 1)."""
+        """Return the sum over parts of texels for one cell (rows, 1): (3, 1).
+
+        edge: Gauss nodes per edge of each part.
+        """
         device = self.task.device
         kind = np.dtype(f"f{precision // 8}")
         x, w = gauss(edge)
@@ -763,7 +778,7 @@ class _Texels:
     # ---------------------------------------------------------------------------------- the sum
 
     def integral(self, begin: int, end: int) -> np.ndarray:
-        """(3, n) radiance of cells [begin, end)."""
+        """Return the radiance of cells `begin` to `end` - 1: (3, n)."""
         task = self.task
         total = np.zeros((3, end - begin))
         if self.base.any():

@@ -163,7 +163,7 @@ def _function_lines(slot: str, entry: Model, function: str, isotropic: bool) -> 
 
 
 def _default_lines(slots: Mapping[str, Model], isotropic: bool, tabled: bool) -> list[str]:
-    """Define what the models of a program leave open."""
+    """Define the functions that the models of a program do not provide."""
     lines = []
     if tabled:
         lines.append(f"#define NDF_AREA(d) area_of_table(d, {', '.join(AREA_NUMBERS)}, ndf_area_terms)")

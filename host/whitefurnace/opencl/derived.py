@@ -78,7 +78,7 @@ def finest(device: Device) -> int:
 
 
 def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.ndarray:
-    """(2, n): 1/norm of a user's D and the angle that holds half of its energy."""
+    """Return 1/norm of a user's D and the angle in radians that holds half of its energy: (2, n)."""
     precision = finest(device)
     theta = np.concatenate(
         [[0.0], np.geomspace(1e-6, math.pi / 4, 600), math.pi / 2 - np.geomspace(math.pi / 4, 1e-6, 400)]
@@ -148,7 +148,7 @@ class Areas:
         program = source.area(self.entry).text
 
         def area(NoV: np.ndarray, rule: int) -> np.ndarray:
-            """(m, n) areas at cosines (m, n) by one of the two rules."""
+            """Return areas at cosines (m, n) by one of the two rules: (m, n)."""
             m = NoV.shape[0]
             cells = np.concatenate([NoV.reshape(1, -1), np.tile(distinct, m)])
             values = over_nodes(

@@ -39,7 +39,7 @@ class Tuning(NamedTuple):
     """
 
     vectors: int  # T: vectors of W lanes a work item
-    local_size: int  # work items a group
+    local_size: int  # work items in a group
     scalar_size: int = 64  # of kernels whose work items are many, small and scalar: a group costs 10 ns on PoCL
     orbits: int = 4  # vectors of outputs that take the same classes in turn while these are in cache (octahedral.cl)
 
@@ -99,7 +99,9 @@ class Candidate:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[list[str]]:
-    """Swallows pyopencl's warnings and what a driver writes to stderr; the list has its lines afterwards."""
+    """Suppress pyopencl's warnings and the lines that a driver writes to stderr; the list has these lines
+    afterwards.
+    """
     lines: list[str] = []
     with contextlib.ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
@@ -124,7 +126,7 @@ def _quiet() -> Iterator[list[str]]:
 
 
 def _pip_runtimes() -> list[Path]:
-    """Libraries from pip that the loader does not find: Intel's .icd holds a placeholder for a path."""
+    """Return runtimes from pip that the loader does not find, because Intel's .icd holds a placeholder for a path."""
     try:
         files = importlib.metadata.files("intel-opencl-rt") or []
     except importlib.metadata.PackageNotFoundError:
@@ -149,10 +151,10 @@ def core_limit(count: int) -> dict[str, str]:
 
 @contextlib.contextmanager
 def _exposed_runtimes() -> Iterator[None]:
-    """Lets the OpenCL loader see pip's runtimes beside the system's while it makes its list, once a process.
+    """Let the OpenCL loader see pip's runtimes in addition to the system's while it makes its list, once per process.
 
-    OCL_ICD_VENDORS replaces the system's folder, so the .icd files from there are copied beside ours. (PoCL
-    from pip needs nothing: pyopencl's loader always looks beside itself.) A user's own setting is left alone.
+    OCL_ICD_VENDORS replaces the system's folder, so the .icd files of that folder are copied to ours. (PoCL from pip
+    needs nothing: pyopencl's loader always looks in its own folder.) A user's own setting is left alone.
     """
     runtimes = [] if "OCL_ICD_VENDORS" in os.environ else _pip_runtimes()
     if not runtimes:
@@ -174,7 +176,7 @@ def _exposed_runtimes() -> Iterator[None]:
 
 
 def _provide_cache() -> None:
-    """Gives the compilers a cache until exit where the user's cannot be written: PoCL fails without one."""
+    """Give the compilers a temporary cache where the user's cannot be written: PoCL fails without one."""
     try:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
         home.mkdir(parents=True, exist_ok=True)
@@ -288,7 +290,7 @@ def _address(raw: Any) -> str:
 
 
 def _refusal(error: BaseException, noise: Sequence[str]) -> str:
-    """One line that tells why a probe failed: the compiler's first error where there is one."""
+    """Return the reason of a failed probe in one line: the compiler's first error where there is one."""
     return _first_errors(str(error), noise, limit=1) or _first_line(error)
 
 
@@ -471,7 +473,7 @@ class Program:
 
 @contextlib.contextmanager
 def _translated(device: Device, doing: str) -> Iterator[None]:
-    """Turns pyopencl's errors into DeviceError."""
+    """Turn pyopencl's errors into DeviceError."""
     try:
         yield
     except _opencl().Error as error:
@@ -479,7 +481,7 @@ def _translated(device: Device, doing: str) -> Iterator[None]:
 
 
 def _first_errors(log: str, noise: Sequence[str] = (), limit: int = 3) -> str:
-    """The first lines of a compiler's log that tell an error, joined by "; ", or nothing."""
+    """Return the first lines of a compiler's log that report an error, joined by "; ", or nothing."""
     lines = [line.strip() for line in [*log.splitlines(), *noise]]
     errors = [line for line in lines if re.search(r"\b(fatal )?error:", line, re.IGNORECASE)]
     return "; ".join(dict.fromkeys(errors[:limit]))
@@ -687,7 +689,7 @@ class Device:
                 self._settle(QUEUE_DEPTH // 2)
 
     def _settle(self, count: int) -> None:
-        """Waits for the oldest `count` launches and adds their times."""
+        """Wait for the oldest `count` launches and add their times."""
         while count > 0 and self._pending:
             event = self._pending[0][0]
             try:
@@ -705,7 +707,7 @@ class Device:
             self._queue.finish()
 
     def _probe(self, precision: int) -> None:
-        """Builds and runs a small kernel; raises DeviceError unless it gives the right answer."""
+        """Build and run a small kernel. Raises DeviceError unless it gives the right result."""
         scalar = np.dtype(f"f{precision // 8}").type
         lanes = self._lanes if precision == 32 else max(self._lanes // 2, 1)
         program = self.build(_probe_text(), {"SCALAR": "float" if precision == 32 else "double", "W": lanes})
@@ -736,7 +738,7 @@ _live: weakref.WeakSet[Device] = weakref.WeakSet()
 
 @atexit.register
 def _drain() -> None:
-    """Lets running kernels end before the driver is unloaded: PoCL's threads crash otherwise."""
+    """Wait for running kernels before the driver is unloaded: PoCL's threads crash otherwise."""
     for device in list(_live):
         with contextlib.suppress(Exception):
             device.finish()

@@ -39,14 +39,14 @@ class Source:
 
 @dataclass(frozen=True)
 class Assembly:
-    """How the text of a program is put together: one row of `PROGRAMS`.
+    """The recipe for the text of a program: one row of `PROGRAMS`.
 
     pieces: its pieces in order. A name is a kernel file, where {words} are filled in; `<name>` is a generated piece:
-      `<bindings>` binds the slots, `<models>` are the texts of their models, `<grid>`, `<anterpolation>` and
-      `<classes>` are constants of the host, and the others are given by the function that assembles the program.
-    slots: the slots that it may bind.
-    cells: what a cell of its input holds before the numbers of the models.
-    defines: macros that its kernels ask for, as `NAME` or `NAME VALUE`; {words} are filled in.
+    `<bindings>` binds the slots, `<models>` are the texts of their models, `<grid>`, `<anterpolation>` and `<classes>`
+    are constants of the host, and the others are given by the function that assembles the program.
+    slots: slots that it may bind.
+    cells: names of the numbers in a cell of its input, before the numbers of the models.
+    defines: macros that its kernels require, as `NAME` or `NAME VALUE`; {words} are filled in.
     """
 
     pieces: tuple[str, ...]
@@ -217,9 +217,9 @@ def assembled(
 ) -> Source:
     """Return the text of a program of `PROGRAMS` with its digest.
 
-    slots: the models that it binds. area_terms: length of the tabulated Smith area, 0 for none. cells: what a cell
-    holds before the numbers of the models, where the program leaves that open. pieces: texts of its generated pieces.
-    words: what is filled into its names of files and macros.
+    slots: the models that it binds. area_terms: length of the table of Smith's area, 0 for none. cells: names of the
+    numbers in a cell before those of the models, where the program leaves them open. pieces: texts of its generated
+    pieces. words: values of the {words} in its file names and macros.
     """
     row, bound, texts = PROGRAMS[program], slots or {}, pieces or {}
     assert set(bound) <= set(row.slots), f"{program} binds {row.slots}, not {tuple(bound)}"
@@ -252,7 +252,7 @@ def assembled(
 
 
 class EntryKey:
-    """A model as the key of what is made from it: this very entry, not another one of the same name."""
+    """A model as a dictionary key. Two keys are equal only for the same entry, not for two entries of the same name."""
 
     def __init__(self, entry: Model) -> None:
         self.entry = entry

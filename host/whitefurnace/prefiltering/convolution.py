@@ -100,7 +100,7 @@ class Convolver:
         self.overlaps = Means(device, self.texels.values, environment.rotation, self.texels.radiance)
         self._symmetries = octahedral_of(device, self.precision)
         self._classes: dict[tuple[int, ...], Classes] = {}  # by exchanges too
-        self._lists: dict[tuple[int, ...], Buffer] = {}  # by nodes an edge and what they were made from
+        self._lists: dict[tuple[int, ...], Buffer] = {}  # by nodes per edge and what they were made from
         self._harmonics: dict[int, np.ndarray] = {}  # 9 × 3 coefficients and ∑w, by cuts
 
     def prepare(self, n: int, cuts: int) -> None:
@@ -192,8 +192,8 @@ class Convolver:
             self.progress(lobe.name, share[0] + (share[1] - share[0]) * min(done * 8 * exchanges / shape.count, 1.0))
 
     def interpolate(self, level: Buffer, shape: Shape, grid: Buffer) -> None:
-        """Write the texels of `shape` into `level`, interpolated from values at the nodes of `grid`, with the base
-        added.
+        """Interpolate the texels of `shape` from values at the nodes of `grid`, add the base, and write them into
+        `level`.
         """
         kernel = self.device.build(source.interpolation().text, {"W": 1, "T": 1, "PRECISION": self.precision}).kernel(
             "interpolate"
@@ -319,8 +319,9 @@ class Convolver:
     def _list_sums(
         self, lobe: Lobe, listed: Buffer, count: int, block: Buffer, window: tuple[float, float] = (0.0, 0.0)
     ) -> np.ndarray:
-        """(4, outputs) float64: ∑K wL and ∑K w of a whole list, beyond a window where there is one, by the NDFs
-        themselves."""
+        """Return ∑K wL and ∑K w of a whole list by the NDFs themselves, beyond a window where there is one: (4,
+        outputs) float64.
+        """
         outputs, splits = block.shape[1], -(-count // planning.CHUNK)
         step = self.device.lanes(self.precision) * self.device.vectors
         total = np.zeros((4, outputs))
@@ -350,7 +351,7 @@ class Convolver:
     # ------------------------------------------------------------------------------------------- harmonics
 
     def _harmonic_sums(self, listed: Buffer, count: int) -> np.ndarray:
-        """(28,) float64: 9 × 3 coefficients of a list, and ∑w."""
+        """Return 9 × 3 coefficients of a list, and ∑w: (28,) float64."""
         chunks = -(-count // HARMONICS_CHUNK)
         partial = self.device.empty((chunks, 28), self.kind)
         self.texels.launch("harmonics", chunks, (partial, np.int32(count), np.int32(HARMONICS_CHUNK), listed))

@@ -137,7 +137,10 @@ class Sampler:
         return out.reshape(*shape.dims, 3)
 
     def _table(self, lobe: Lobe, count: int) -> tuple[np.ndarray, int, int]:
-        """(count, 5) float64 as `add_samples` reads them, how many never leave the first level, and its size."""
+        """Return samples (count, 5) float64 as `add_samples` reads them, and facts about the first level.
+
+        The facts are the number of samples that never leave it, and its size.
+        """
         light, share, solid_angle = light_samples(lobe, count)
         size = self.size
         if size < LARGEST_SOURCE and 4 / size**2 > CROWDED * solid_angle.min():
@@ -196,6 +199,6 @@ def _energy(lobe: Lobe) -> tuple[np.ndarray, np.ndarray]:
 
 @lru_cache(maxsize=2 * LARGEST_SOURCE.bit_length())
 def _weights(n: int) -> np.ndarray:
-    """(n, n) solid angles of a face's texels as multiples of their mean: all that averages need."""
+    """Return the solid angles of a face's texels relative to their mean, (n, n), as weights of averages."""
     omega = cube_solid_angles(n)
     return omega / omega.mean()

@@ -71,7 +71,7 @@ def read_mixtures(device: Device, recipe: Chain) -> tuple[Mixture | None, ...]:
 
 
 class _Lobes:
-    """What a chain's NDF does at an angle, hashed by the NDF's canonical form and the chain's mapping."""
+    """The values of a chain's NDF at any angle, hashed by the NDF's canonical form and the chain's mapping."""
 
     def __init__(self, device: Device, recipe: Chain, key: str) -> None:
         self.device, self.recipe, self.key = device, recipe, key
@@ -115,7 +115,9 @@ def angles() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _disc(radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Angles from a disc's centre at which it is seen, finest at its edge, and the share of the sphere each is for."""
+    """Return angles from a disc's centre at which it is seen, finest at its edge, and the share of the sphere of
+    each.
+    """
     off = np.concatenate([-np.geomspace(0.6 * radius, 1e-3, 12), np.geomspace(1e-3, math.pi - radius - 1e-3, 48)])
     seen = radius + off
     edges = np.concatenate([[0.0], (seen[1:] + seen[:-1]) / 2, [math.pi]])
@@ -203,8 +205,11 @@ def _squares(
     omega: np.ndarray,
     floor: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of one scene, at each scored r: the quadratic form of the squared relative error in the weights, (r, p, p),
-    (r, p) and (r,). exact: (angles, r); nodes: (angles, p); mirror: (angles, 1), what level 0 shows."""
+    """Return the squared relative error of one scene at each scored r, as a quadratic form in the weights.
+
+    The form is (r, p, p), (r, p) and (r,). exact: (angles, r); nodes: (angles, p); mirror: (angles, 1), the image that
+    level 0 shows.
+    """
     count = level.size
     gram, right = np.zeros((steps.size, count, count)), np.zeros((steps.size, count))
     rest = np.zeros(steps.size)
@@ -225,10 +230,10 @@ def _squares(
 def _constrained(
     a: np.ndarray, b: np.ndarray, sums: np.ndarray, allowed: np.ndarray, least: np.ndarray, level: np.ndarray
 ) -> np.ndarray:
-    """min ½cᵀac - bᵀc with sums @ c = 1 and every level's ∑ c·allowed ≥ least.
+    """Minimize ½cᵀac - bᵀc with sums @ c = 1 and ∑ c·allowed ≥ least for every level.
 
-    A dual active-set method [Goldfarb1983]: the angles that are lowest are held as equalities, and any that then pull
-    the wrong way are given up before the next are looked for. `_mixture` closes what may be left.
+    A dual active-set method [Goldfarb1983]: the angles with the lowest values are held as equalities, and any that then
+    pull the wrong way are released before the next ones are searched. `_mixture` removes what violation remains.
     """
     count = level.size
 

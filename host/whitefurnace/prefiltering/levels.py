@@ -98,7 +98,7 @@ def _work(job: Job) -> int:
 
 
 def _progress(share: float) -> float:
-    """Progress of the whole when a share of the levels' work is done."""
+    """Return the progress of the whole when a share of the levels' work is done."""
     return EXACT_SHARE + (1 - EXACT_SHARE) * share
 
 

@@ -27,10 +27,9 @@ sharp or thin there."""
 
 @dataclass(frozen=True)
 class Series:
-    """A series for a lobe, P of `kernels/lobe_table.clh`: K = (1 - q/2)₊ x^power P(slope x - offset), x = 1/(q +
-    shift).
+    """A series that approximates a lobe: K = (1 - q/2)₊ x^power P(slope x - offset), x = 1/(q + shift).
 
-    `error` is ∫|K - series| dω / ∫K dω in exact arithmetic.
+    P is the polynomial of `kernels/lobe_table.clh`. `error` is ∫|K - series| dω / ∫K dω in exact arithmetic.
     """
 
     shift: float
@@ -88,7 +87,7 @@ _fitted: dict[Any, Series] = {}
 
 @cache
 def _chebyshev(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """(nodes in [-1, 1], matrix from the values at the nodes to the coefficients) of a Chebyshev series."""
+    """Return the nodes of a Chebyshev series in [-1, 1], and the matrix from values at the nodes to coefficients."""
     angle = (np.arange(count) + 0.5) * math.pi / count
     matrix = 2 / count * np.cos(np.outer(np.arange(count), angle))
     matrix[0] /= 2

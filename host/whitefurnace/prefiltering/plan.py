@@ -114,10 +114,10 @@ def kink(horizon: float) -> float:
 
 
 def grid_size(alpha: float, tolerance: float, horizon: float | None = None) -> int:
-    """Return the nodes of a face edge, a multiple of 16, with which a lobe meets a tolerance of the 99th percentile.
+    """Return the nodes per face edge, a multiple of 16, with which a lobe meets a tolerance.
 
-    alpha: width of the lobe. tolerance: of the texel error. horizon: the α at which GGX's kink at the horizon is as
-    strong as the lobe's; by default alpha itself.
+    alpha: width of the lobe. tolerance: largest 99th percentile of the texel errors. horizon: the α at which GGX's kink
+    at the horizon is as strong as the lobe's; by default alpha itself.
     """
     finer = (1e-3 / tolerance) ** (1 / RATE)
     n = max(
@@ -162,7 +162,7 @@ SHARP_ENOUGH = 0.1
 """Largest α of a lobe that carries too little near the horizon for its kink to matter."""
 
 MOST_CUTS = 64
-"""Largest number of nodes a texel edge in the search for converged reference nodes: 4096 nodes a texel."""
+"""Largest number of nodes per texel edge in the search for converged reference nodes: 4096 per texel."""
 
 
 CENTRE_ERROR = 1e-5
@@ -170,7 +170,7 @@ CENTRE_ERROR = 1e-5
 whose texels differ by factors of 20."""
 
 CENTRED = (4, 2, 1)
-"""Numbers of parts an edge into which texels may be cut for masses at corrected centres."""
+"""Numbers of parts per edge into which texels may be cut for masses at corrected centres."""
 
 
 def cuts_for(texel: float, alpha: float, tolerance: float, share: float = 0.0, centred: int = 1) -> int:

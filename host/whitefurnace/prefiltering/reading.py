@@ -145,7 +145,7 @@ def single(roughness: float) -> Mixture:
 
 
 class Exact:
-    """Exact values of a chain's lobes in any direction, integrated over texels as large as each lobe allows."""
+    """Computes exact values of a chain's lobes in any direction, over texels as large as each lobe allows."""
 
     def __init__(self, device: Device, env: Environment, recipe: Chain) -> None:
         self.device, self.env, self.recipe = device, env, recipe
@@ -229,9 +229,10 @@ class Exact:
 
 
 class Interpolated:
-    """Exact values in fixed directions at any roughness of a range.
+    """Interpolates exact values in fixed directions at any roughness of a range.
 
-    Their logarithm is interpolated cubically in log r, since they are positive, span decades and are smooth in r.
+    The logarithm of the values is interpolated cubically in log r, since they are positive, span decades and are smooth
+    in r.
     """
 
     def __init__(self, exact: Exact, d: np.ndarray, smoothest: float) -> None:
@@ -406,7 +407,7 @@ class Reader:
     def _texels(
         self, recipe: Chain, mixtures: Sequence[Mixture], tapped: Sequence[tuple[np.ndarray, np.ndarray]]
     ) -> list[np.ndarray]:
-        """Exact values (4, m, 3) of the texels that each level is read from."""
+        """Return exact values of the texels from which each level is read, (4, m, 3)."""
         wanted, places = [], []
         for (size, roughness), mixture, (index, _) in zip(recipe.levels, mixtures, tapped, strict=True):
             distinct, back = np.unique(index, return_inverse=True)

@@ -90,7 +90,7 @@ def lod_of_roughness(roughness: float, levels: int) -> float:
 
 
 LOD_NAMES = ("r", "alpha", "max_lod", "width")
-"""Variables of an engine's lod formula: perceptual roughness, its square, levels - 1, and texels an edge of level 0."""
+"""Variables of an engine's lod formula: perceptual roughness, its square, levels - 1, and the edge of level 0."""
 
 ROUGHEST = 4.0
 """Largest perceptual roughness of a level, α = 16. Babylon's last mips have α = 1.4 and 3.4."""
@@ -305,10 +305,10 @@ def chain(
     usual_min: int = MIN_SIZE,
     only_levels: str | None = None,
 ) -> Chain:
-    """A validated specular chain.
+    """Check the choice of a specular chain and return it.
 
     ndf: name, entry or path of an isotropic NDF. size, min_size: face edges of the first and last level in texels,
-    powers of two. levels: their number; without `min_size` each level halves, with it sizes halve to `min_size` and
+    powers of two. levels: number of levels; without `min_size` each level halves, with it sizes halve to `min_size` and
     stay. tolerance, quality, samples: accuracy, at most one of them; 1e-3 without. fit: "read" or None. certify:
     uniform texels of each certificate, 0 for none. lods: the mapping of an engine, by default Filament's and
     three.js's. usual_min: last size where neither `min_size` nor `levels` is given. only_levels: "A-B", the levels that

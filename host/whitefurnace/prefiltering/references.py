@@ -21,7 +21,7 @@ COARSE = {"sharp": 2.0, "rough": 2.2}
 is 2^6.5 = 90 times smaller where the lobe's width decides, 2.2² = 5 times smaller where its kink does."""
 
 COARSE_GRID = 512
-"""Largest number of nodes an edge of such a grid. For sharper lobes texels are summed, only those near their direction
+"""Largest number of nodes per edge of such a grid. For sharper lobes texels are summed, only those near their direction
 if need be."""
 
 
@@ -31,8 +31,8 @@ class Reference:
 
     job     the level; its plan gets the cuts that the texels turn out to need
     sample  texel indices: a uniform draw and the near-source sample
-    cuts    nodes an edge into which a source texel is cut for the reference
-    grid    nodes an edge of the grid that replaces the texels, 0 for none
+    cuts    nodes per edge into which a source texel is cut for the reference
+    grid    nodes per edge of the grid that replaces the texels, 0 for none
     values  (m, 3) exact values of the sample's texels
     doubt   estimated error of the values, as a texel error
     """
@@ -81,7 +81,7 @@ def references_of(convolver: Convolver, jobs: Sequence[Job], tolerance: float, c
 
 
 def _integrate(convolver: Convolver, todo: Sequence[Reference], tolerance: float) -> None:
-    """Computes the values of references, on their grids or over every texel."""
+    """Compute the values of references, on their grids or over every texel."""
     for one in todo:
         if one.grid:
             one.values = convolver.on_grid(one.job.own_lobe, one.job.shape.directions(one.index), one.grid, tolerance)
@@ -95,7 +95,7 @@ def _integrate(convolver: Convolver, todo: Sequence[Reference], tolerance: float
 
 
 def _doubted(convolver: Convolver, todo: Sequence[Reference], tolerance: float) -> list[Reference]:
-    """Measures the doubt of references and refines the plans of those whose doubt is too large; these are returned."""
+    """Measure the doubt of references, refine the plans of those whose doubt is too large, and return these."""
     by_cuts: dict[int, list[tuple[Reference, float]]] = {}
     for one in todo:
         detected = _detected(convolver, one)
@@ -142,7 +142,7 @@ def _detected(convolver: Convolver, one: Reference) -> float:
 def _exact(
     convolver: Convolver, group: Sequence[Reference], indices: Sequence[np.ndarray], cuts: int, tolerance: float
 ) -> list[np.ndarray]:
-    """Exact values of each level's texels `indices`, in one pass over the source."""
+    """Return exact values of each level's texels `indices`, in one pass over the source."""
     return convolver.exact(
         [(one.job.own_lobe, one.job.shape.directions(index)) for one, index in zip(group, indices, strict=True)],
         cuts,

@@ -73,7 +73,7 @@ class Texels:
         self.cuts = 1
 
     def _extract(self) -> None:
-        """Clips BRIGHT texels of largest radiance × solid angle to the smallest of them.
+        """Clip BRIGHT texels, those of largest radiance × solid angle, to the smallest of them.
 
         A sun then leaves neither a firefly nor a hole, since its excess is summed exactly for each output. A small
         image has few bright texels, because many nodes for each of them would cost more than the grid. `share` is the

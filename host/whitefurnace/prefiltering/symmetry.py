@@ -167,7 +167,7 @@ class Octahedral:
         self.device.launch(self._kernel(name, exchanges), (-(-count // size) * size,), args, (size,))
 
     def _kept(self, key: Any, values: np.ndarray) -> Buffer:
-        """`values` on the device in the working precision (integers as they are), made once for `key`."""
+        """Return `values` on the device in the working precision (integers unchanged), made once for each `key`."""
         if key not in self._on_device:
             kind = values.dtype if values.dtype.kind == "i" else self.kind
             self._on_device[key] = self.device.array(values.astype(kind))
@@ -305,8 +305,9 @@ class Octahedral:
     ) -> None:
         """Write the texels of these orbits into `level`, (dims, 3 or 4) float32.
 
-        The value is the partial sums of both kinds of parts divided by their weights, plus `apart` times per_norm, plus
-        the base. Without `whole` the sums are added to the level.
+        whole, close: partial sums of the parts with and without transforms, or None. apart: sums over single sources,
+        or None. The value is the partial sums divided by their weights, plus `apart` times per_norm, plus the base.
+        Without `whole` the sums are added to the level.
         """
         real, shape = self.kind.type, found.shape
         number = self._kept(("number", shape, found.first, found.padded), found.number)

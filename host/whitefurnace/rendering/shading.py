@@ -212,7 +212,7 @@ def _split_sum(
     NoV: np.ndarray,
     insulator: Any = DIELECTRIC,
 ) -> Weights:
-    """[Karis2013]: the energy that single scattering loses stays lost."""
+    """Weight as [Karis2013] does: the energy that single scattering loses is not restored."""
     E = (insulator + (color - insulator) * metal) * A + B
     return E, color * (1 - metal) * (1 - E)
 
@@ -277,8 +277,10 @@ def _khronos(
     NoV: np.ndarray,
     insulator: Any = DIELECTRIC,
 ) -> Weights:
-    """Khronos glTF Sample Viewer: [FdezAguera2019] with a Fresnel term that depends on roughness, multiplied by
-    radiance."""
+    """Weight as Khronos glTF Sample Viewer does.
+
+    It is [FdezAguera2019] with a Fresnel term that depends on roughness, multiplied by radiance.
+    """
 
     def fresnel(F0: Any) -> np.ndarray:
         k = F0 + (np.maximum(1 - r, F0) - F0) * (1 - NoV) ** 5

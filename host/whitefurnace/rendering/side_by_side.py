@@ -179,9 +179,9 @@ class Spheres:
     ) -> tuple[list[np.ndarray], list[np.ndarray], int, float, dict[str, Term]]:
         """Compute the true radiance of spheres of one roughness.
 
-        Returns the radiance (m, 3) by the environment for each sphere, that by the further lights for each, the samples
-        of a point, their estimated error, and the terms. tolerance: of the 99th percentile of the specular part's
-        errors.
+        Returns the radiance (m, 3) by the environment for each sphere, the radiance by the further lights for each, the
+        samples per point, their estimated error, and the terms. tolerance: largest 99th percentile of the specular
+        part's errors.
         """
         truth, points = self.truth, self.points
         found = self.material.terms(roughness)
@@ -197,7 +197,7 @@ class Spheres:
             lit[name] = self.lit(one) if self.lights else 0 * made[name][0]
 
         def of(what: str, F0: Any, values: Mapping[str, Any], albedo: bool = False) -> np.ndarray:
-            """(m, 3) of the dielectric or the metal."""
+            """Return the values (m, 3) of the dielectric or the metal."""
             held = values[what if what in values else "both"]
             S = held[1] if albedo else held[0] if isinstance(held, tuple) else held
             S = np.broadcast_to(S[..., None], (*S.shape, 3)) if albedo else S
@@ -387,8 +387,8 @@ def panels(
 ) -> Shown:
     """Draw the spheres of `shading.drawn` as the engine shows them, as they truly look, and the difference.
 
-    material: the reflection model of the truth; a roughness below MIRROR is a mirror in it. tolerance: of the 99th
-    percentile of errors of the specular part of each roughness, relative to its value or 1e-3 of the mean radiance.
+    material: the reflection model of the truth; a roughness below MIRROR is a mirror in it. tolerance: largest 99th
+    percentile of the specular part's errors for each roughness, relative to its value or 1e-3 of the mean radiance.
     certify: number of pixels of each roughness that are compared with the quadrature. further: lights that are added to
     both pictures. Raises the errors of `shading.drawn`.
     """
@@ -456,7 +456,7 @@ def _certificate(
     count: int,
     mean: float,
 ) -> list[Certified]:
-    """Pixels by the golden ratio over the sphere, of one variant after the other."""
+    """Compare pixels with the quadrature, chosen by the golden ratio over the sphere, one variant after the other."""
     found = []
     variants = [(name, one, k) for name, one in terms.items() for k in range(one.sets)]
     for number in range(first, first + many):

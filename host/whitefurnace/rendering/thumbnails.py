@@ -134,7 +134,7 @@ def _matte(manifest: Path, stated: Mapping[str, Any], engine: Engine, lights: Li
 
 
 def _harmonics(manifest: Path, stated: Mapping[str, Any]) -> np.ndarray:
-    """(m, 3) E/π at a sphere's normals from the coefficients that every manifest has."""
+    """Return E/π at a sphere's normals, (m, 3), from the coefficients that every manifest has."""
     sh = stated.get("sh")
     try:
         values = np.array(sh["coefficients"] if isinstance(sh, Mapping) else None, np.float64)
@@ -146,13 +146,13 @@ def _harmonics(manifest: Path, stated: Mapping[str, Any]) -> np.ndarray:
 
 
 def _of_octahedral(texels: np.ndarray, border: int) -> np.ndarray:
-    """A cube of FACE² texels a face, read from an octahedral map in the same axes."""
+    """A cube of FACE² texels per face, read from an octahedral map in the same axes."""
     d = cube_centres(FACE, np.arange(6 * FACE * FACE))
     return level(texels, d, border).reshape(6, FACE, FACE, 3)
 
 
 def _of_latlong(texels: np.ndarray) -> np.ndarray:
-    """A cube of FACE² texels a face, read from a lat-long image whose rows are reduced to 2 FACE by means of four."""
+    """A cube of FACE² texels per face, read from a lat-long image whose rows are reduced to 2 FACE by means of four."""
     while texels.shape[0] > 2 * FACE and texels.shape[0] % 2 == 0 and texels.shape[1] % 2 == 0:
         texels = _halved(texels.astype(np.float32))
     rows, columns = texels.shape[:2]
@@ -163,7 +163,7 @@ def _of_latlong(texels: np.ndarray) -> np.ndarray:
 
 
 def _reduced(texels: np.ndarray) -> np.ndarray:
-    """A cube of at most FACE texels a face edge, by means of four. NaN becomes 0, and infinite values the largest
+    """A cube of at most FACE texels of a face edge, by means of four. NaN becomes 0, and infinite values the largest
     finite one."""
     texels = np.asarray(texels, np.float32)
     finite = np.isfinite(texels)

@@ -385,7 +385,7 @@ class Truth:
         )
 
     def _numbers(self, found: Term) -> tuple[np.ndarray, int]:
-        """(k, S) numbers of the models as kernels take them, and the terms of the table of Smith's area."""
+        """Return the numbers of the models as kernels take them, (k, S), and the terms of the table of Smith's area."""
         models = {slot: choice.model for slot, choice in found.models.items()}
         part = Part(self.device, integral("albedo"), models, self.precision)
         grid = grid_of(
@@ -410,7 +410,7 @@ class Truth:
         components: int,
         progress: Callable[[float], None] | None,
     ) -> np.ndarray:
-        """(m, S, components) sums of a kernel of `truth.cl` over `count` samples or lights."""
+        """Return the sums of a kernel of `truth.cl` over `count` samples or lights: (m, S, components)."""
         device, sets = self.device, found.sets
         models = {slot: choice.model for slot, choice in found.models.items()}
         lanes = device.lanes(self.precision)
@@ -448,10 +448,10 @@ class Truth:
         return out
 
     def _samples(self, found: Term, numbers: np.ndarray, count: int, size: int) -> tuple[str, np.ndarray]:
-        """How directions are drawn, and the (count, 4) table that `truth.cl` reads.
+        """Return the macro that says how directions are drawn, and the (count, 4) table that `truth.cl` reads.
 
-        Ω is over the solid angle of a texel at the middle of a face, 4/size²; a lattice of two dimensions as in
-        `samples.light_samples`.
+        Ω is relative to the solid angle of a texel at the middle of a face, 4/size²; the samples are a lattice of two
+        dimensions as in `importance.light_samples`.
         """
         u = (np.arange(count) + 0.5) / count
         phi = 2 * math.pi * np.mod(np.arange(count) * GOLDEN, 1.0)

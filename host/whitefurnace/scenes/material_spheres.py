@@ -42,8 +42,8 @@ class MaterialSphere:
 class SphereLayout:
     """Spheres row by row, `columns` to a row; the last row may have fewer.
 
-    roughness  of the columns of a grid; `metalness` of its rows; both empty for a scene
-    notices    what the spheres leave out
+    roughness  perceptual roughness of the columns of a grid; `metalness` of its rows; both empty for a scene
+    notices    sentences about parts of the materials that the spheres leave out
     scene      path of the scene, "" for a grid
     """
 
@@ -59,7 +59,7 @@ class SphereLayout:
         return -(-len(self.spheres) // self.columns)
 
     def placed(self) -> tuple[dict[str, object], ...]:
-        """For a scene: each material's name, its row and column from 1, and the values of its sphere."""
+        """Each material of a scene with its name, its row and column from 1, and the values of its sphere."""
         return (
             tuple(
                 {

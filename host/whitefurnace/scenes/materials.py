@@ -551,7 +551,10 @@ class _Reading:
         return lambda: _spread(texture, p, np.zeros_like(factor), factor)
 
     def _thickness(self, k: int, primitives: Sequence[dict[str, Any]]) -> Callable[[], Spread]:
-        """Of the iridescent film, in nm: from minimum to maximum by the texture's G, the maximum without one."""
+        """Return the spread of the iridescent film's thickness in nm.
+
+        It runs from minimum to maximum by the texture's G; without a texture it is the maximum.
+        """
         name = _KHR + "iridescence"
         holder, what = self._holder(k, name)
         ends = [
@@ -567,7 +570,7 @@ class _Reading:
         )
 
     def _texture(self, holder: Any, name: str, what: str, primitives: Sequence[dict[str, Any]]) -> _Use | None:
-        """What of which image a property is multiplied with; None for no texture."""
+        """Return the image and channels that multiply a property; None for no texture."""
         info = None if holder is None else holder.get(name) if isinstance(holder, dict) else getattr(holder, name, None)
         if info is None:
             return None
@@ -609,7 +612,7 @@ class _Reading:
         return uses[key]
 
     def _moved(self, transform: dict[str, Any], where: str) -> np.ndarray:
-        """(2, 3) of KHR_texture_transform: translation · rotation · scale."""
+        """Return the matrix (2, 3) of KHR_texture_transform: translation · rotation · scale."""
         x, y = self._numbers(transform.get("offset", [0, 0]), f"offset of {where}", 2)
         a, b = self._numbers(transform.get("scale", [1, 1]), f"scale of {where}", 2)
         turn = self.take.number(transform.get("rotation", 0), f"rotation of {where}")
@@ -619,7 +622,9 @@ class _Reading:
     def _boxes(
         self, primitives: Sequence[dict[str, Any]], coordinates: int, moved: np.ndarray, wraps: tuple[int, int]
     ) -> np.ndarray | None:
-        """(n, 4) boxes around the triangles of primitives on an image, None where that is all of it or not known."""
+        """Return boxes (n, 4) around the triangles of primitives on an image, None where they cover all of it or are
+        unknown.
+        """
         found = []
         for one in primitives:
             number = one["attributes"].get(f"TEXCOORD_{coordinates}")
@@ -675,8 +680,10 @@ def _three(values: Iterable[float]) -> tuple[float, float, float]:
 
 
 def _around(triangles: np.ndarray, wraps: tuple[int, int]) -> np.ndarray:
-    """(n, 4) boxes in [0, 1]² around triangles (n, 3, 2) of texture coordinates as a sampler wraps them; what is not
-    finite, or reaches over an edge, is the whole axis."""
+    """Return boxes (n, 4) in [0, 1]² around triangles (n, 3, 2) of texture coordinates as a sampler wraps them.
+
+    A range that is not finite or that reaches over an edge becomes the whole axis.
+    """
     low, high = triangles.min(1), triangles.max(1)
     out = np.empty((len(triangles), 4))
     for axis, wrap in enumerate(wraps):
@@ -704,7 +711,7 @@ def _tiles(boxes: np.ndarray, rows: int, columns: int) -> np.ndarray:
 
 
 def _count(bands: Iterable[tuple[int, int, int, np.ndarray]], uses: Sequence[_Use]) -> None:
-    """Counts the codes (4, 256 or 65536) of what each use uses of an image."""
+    """Count the codes (4, 256 or 65536) in the part of an image that each use reads."""
     masks: list[np.ndarray | None] = []
     for height, width, y, codes in bands:
         rows, columns = min(height, TILES), min(width, TILES)

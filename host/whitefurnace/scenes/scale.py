@@ -311,7 +311,7 @@ class Transport:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a medium needs at a scale. `absorption` is None without a size, `transport` without a pixel."""
+    """The needs of a medium at a scale. `absorption` is None without a size, `transport` without a pixel."""
 
     medium: Medium
     size: float | None

@@ -47,9 +47,9 @@ class Cell(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """A placement of faces in an image, known by its aspect ratio `columns` : `rows`.
+    """A placement of faces in an image, recognized by its aspect ratio `columns` : `rows`.
 
-    cells: those of the faces +X -X +Y -Y +Z -Z; none for a lat-long.
+    cells: cells of the faces +X -X +Y -Y +Z -Z; none for a lat-long.
     """
 
     name: str
@@ -79,19 +79,19 @@ _FLOAT_MAX = np.finfo(np.float32).max
 class Environment:
     """Radiance from every direction, linear Rec.709, piecewise constant over `texels`.
 
-    texels      float32, C-contiguous: "latlong" (h, w, 3), row 0 at +Y, u = atan2(z, x)/2pi + 1/2 from left
-                to right; "cube" (6, n, n, 3), GL-direct: +X -X +Y -Y +Z -Z, rows top-down
+    texels      float32, C-contiguous: "latlong" (h, w, 3), row 0 at +Y, u = atan2(z, x)/2pi + 1/2 from left to right;
+                "cube" (6, n, n, 3), GL-direct: +X -X +Y -Y +Z -Z, rows top-down
     coverage    the fourth channel, float32 (h, w) or (6, n, n) in [0, 1]; None where it is 1 everywhere
-    rotation    radians in [-pi, pi] that the azimuth atan2(z, x) of everything is still to be increased by
-    exposure    EV that `texels` have been multiplied with already
+    rotation    radians in [-pi, pi] that are still to be added to the azimuth atan2(z, x) of everything
+    exposure    EV by which `texels` have been multiplied already
     name        stem of the source
-    layout      how it was placed: a name of `LAYOUTS`, "six faces" or "cube" (an array of six faces)
-    digest      sha256 hex of the source's bytes; options are not in it
-    notices     sentences about what was converted, clamped or left out
-    statistics  width, height (texels, of one face for a cube); mean (R, G, B) over the sphere; maximum, of
-                the mean of a texel's channels, and max_over_mean, its ratio to the mean (1 for black);
-                brightest, the direction (x, y, z) of that texel, rotation included; brightest_share, in
-                [0, 1], the share of the energy in the 64 texels with the most (0 for black)
+    layout      name of the layout it was read from: one of `LAYOUTS`, "six faces" or "cube" (an array of six faces)
+    digest      sha256 of the source's bytes in hex; options are not in it
+    notices     sentences about data that were converted, clamped or left out
+    statistics  width and height in texels, of one face for a cube; mean (R, G, B) over the sphere; maximum, that of the
+                mean of a texel's channels, and max_over_mean, its ratio to the mean (1 for black); brightest, the
+                direction (x, y, z) of that texel, rotation included; brightest_share, in [0, 1], the share of the
+                energy in the 64 texels with the most (0 for black)
     """
 
     kind: Literal["latlong", "cube"]
@@ -260,8 +260,10 @@ def _stamps(path: Path) -> tuple[tuple[int, ...], ...] | None:
 
 
 def _check_unchanged(path: Path, before: tuple[tuple[int, ...], ...] | None, digest: str) -> None:
-    """Refuses a source that was written to between the digest and the last pixel: the manifest would say of one what
-    was made of another. Raises `FileError`."""
+    """Refuse a source that was written to between the digest and the last pixel. Raises `FileError`.
+
+    Otherwise the manifest would state the digest of one file for the result of another.
+    """
     after = _stamps(path)
     changed = before is None or after != before
     # A second write within a tick of the clock leaves the times as they were; its bytes tell.

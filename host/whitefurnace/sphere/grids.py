@@ -366,7 +366,7 @@ def corrections(latlong: bool, rows: int, columns: int) -> Correction:
 
 
 def _mean_weights(at: int) -> np.ndarray:
-    """(5,): the mean over the texel `at` of the quartic through the centres of texels 0 … 4."""
+    """Return the weights (5,) of the mean over the texel `at` of the quartic through the centres of texels 0 … 4."""
     powers = np.arange(5)
     moments = ((at + 0.5) ** (powers + 1) - (at - 0.5) ** (powers + 1)) / (powers + 1)
     return np.linalg.solve(np.arange(5.0)[None] ** powers[:, None], moments)

@@ -263,7 +263,9 @@ def _nearest(irradiance: np.ndarray, least: np.ndarray) -> np.ndarray:
 
 
 def _edge(channels: np.ndarray, mean: np.ndarray, ray: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where the ray (..., 2) leaves the windows that serve every channel, (..., 2), and the edge's normal there."""
+    """Return where the ray (..., 2) leaves the windows that are valid for every channel, (..., 2), and the edge's
+    normal.
+    """
     gain = np.concatenate([np.zeros((*ray.shape[:-1], 1)), ray], -1)[..., None, BANDS]
     least, where = minimum(channels * gain)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -102,7 +102,7 @@ def from_atlas(image: np.ndarray, places: Sequence[Place], b: int) -> tuple[np.n
 
 
 def _bilinear(images: np.ndarray, k: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """(m, c): images (count, h, w, c) at the image k, column x and row y."""
+    """Read images (count, h, w, c) bilinearly at the image k, column x and row y: (m, c)."""
     height, width = images.shape[1:3]
     j = np.clip(np.floor(x).astype(int), 0, width - 1)
     i = np.clip(np.floor(y).astype(int), 0, height - 1)

@@ -70,7 +70,7 @@ def mean_over_texels(
 
 
 def _ranges(first: Ints, last: Ints) -> tuple[Ints, Ints]:
-    """(owner, value) of the concatenated ranges first[k] … last[k] - 1; empty ones leave nothing."""
+    """Return (owner, value) of the concatenated ranges first[k] … last[k] - 1; empty ranges leave nothing."""
     count = np.maximum(last - first, 0)
     owner = np.repeat(np.arange(len(count)), count)
     value = np.arange(len(owner)) + np.repeat(first - (np.cumsum(count) - count), count)
@@ -78,7 +78,7 @@ def _ranges(first: Ints, last: Ints) -> tuple[Ints, Ints]:
 
 
 def _intervals(owners: list[Ints], points: list[Floats], low: Floats, high: Floats) -> tuple[Ints, Floats, Floats]:
-    """(owner, from, to) of the pieces that the breakpoints within [low, high] cut each owner's range into."""
+    """Return (owner, from, to) of the pieces into which the breakpoints within [low, high] cut each owner's range."""
     own = np.arange(len(low))
     owner = np.concatenate([own, own, *owners])
     point = np.concatenate([low, high, *points])
@@ -91,7 +91,7 @@ def _intervals(owners: list[Ints], points: list[Floats], low: Floats, high: Floa
 
 
 def _sum_by(owner: Ints, values: Floats, count: int) -> Floats:
-    """(count, 3) sums of values (n, 3) by owner."""
+    """Return the sums of values (n, 3) by owner, (count, 3)."""
     return np.stack([np.bincount(owner, values[:, k], count) for k in range(3)], 1)
 
 
@@ -298,7 +298,9 @@ def _between(
     first: Ints,
     last: Ints,
 ) -> Floats:
-    """(3,): ∑ width · ∑ over rows top + first … top + last - 1 of step · L, by prefix sums of the columns used."""
+    """Return ∑ width · ∑ over rows top + first … top + last - 1 of step · L, (3,), by prefix sums of the columns
+    used.
+    """
     total = np.zeros(3)
     used, which = np.unique(column, return_inverse=True)
     last = np.maximum(first, last)
@@ -453,7 +455,7 @@ def _cube_on_cube(texels: npt.NDArray[np.float32], size: int, flat: Ints) -> Flo
 
 
 def _to_face(face: int, d: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats, Floats]:
-    """(s, t, axis) components of d in the frame of a face of the GL-direct layout."""
+    """Return the components (s, t, axis) of d in the frame of a face of the GL-direct layout."""
     x, y, z = d
     return ((-z, -y, x), (z, -y, -x), (x, z, y), (x, -z, -y), (x, -y, z), (-x, -y, -z))[face]
 

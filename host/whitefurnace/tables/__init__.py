@@ -1,1 +1,1 @@
-"""Lookup tables: one module a kind of table."""
+"""Lookup tables: one module for each kind of table."""

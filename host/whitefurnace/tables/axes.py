@@ -56,7 +56,7 @@ class Axis:
         return np.linspace(self.low, self.high, self.count)
 
     def _cosines(self, share: np.ndarray) -> np.ndarray:
-        """Cosines at shares of an "angle" axis. The ends are exact."""
+        """Return cosines at positions along an "angle" axis. The ends are exact."""
         first, last = math.acos(self.low), math.acos(self.high)
         values = np.cos(first + (last - first) * share)
         return np.where(share == 0, self.low, np.where(share == 1, self.high, values))

@@ -407,7 +407,7 @@ def _width(span: Span) -> float:
 
 
 def _shift(span: Span) -> float:
-    """Of 2 u/width - shift."""
+    """Evaluate the series at 2 u/width - shift."""
     low, high = (math.log(span.low), math.log(span.high)) if span.log else (span.low, span.high)
     return (high + low) / (high - low)
 

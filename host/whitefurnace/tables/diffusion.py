@@ -204,7 +204,10 @@ def integrated(found: Profile, NoL: np.ndarray, curvature: np.ndarray) -> tuple[
 
 
 def _ratio(found: Profile, radii: np.ndarray, x: np.ndarray, share: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """(rows, columns, 3) by the nodes x, `share` (columns, nodes) of the integral and `weights` of the whole."""
+    """Return the integrals over the nodes x, divided by that of the whole: (rows, columns, 3).
+
+    share: (columns, nodes) weights of the integral. weights: those of the whole.
+    """
     q = found.line_spread(2 * radii[:, None] * np.sin(x / 2))
     D = np.einsum("cx,rxk->rck", share, q, optimize=True) / np.einsum("x,rxk->rk", weights, q)[:, None]
     return np.asarray(np.maximum(D, 0))  # a mean of what is nowhere negative, but for rounding

@@ -117,7 +117,7 @@ def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str
     A, B = np.asarray(pairs.values[..., 0], float), np.asarray(pairs.values[..., 1], float)
 
     def furnace(which: str, f0: float) -> np.ndarray:
-        """What leaves a surface of reflectance f0 in a white furnace."""
+        """Return the light that leaves a surface of reflectance f0 in a white furnace."""
         single, average = f0 * A + B, f0 + (1 - f0) / 21
         if f0 == 1:
             single = E.values

@@ -152,9 +152,10 @@ class Fit:
 
 
 def _value(lobes: Lobes, N: np.ndarray, which: np.ndarray, rule: Rule, soft: float) -> tuple[np.ndarray, ...]:
-    """m (n,), its gradient (n, 4) and matrix (n, 4, 4) in δ.
+    """Return m (n,), its gradient (n, 4) and matrix (n, 4, 4) in δ.
 
-    A lobe that slips between the nodes would seem to fit: what they miss of p above the horizon counts as misplaced.
+    A lobe that slips between the nodes would seem to fit, so the part of p above the horizon that the nodes miss counts
+    as misplaced.
     """
     sums = lobes.descend(N, which, rule, soft)
     below, along = horizon(N)
@@ -168,7 +169,7 @@ def _value(lobes: Lobes, N: np.ndarray, which: np.ndarray, rule: Rule, soft: flo
 
 
 def _moved(N: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """(1 + δ) N, δ = (xx, xz, zx, zz): (4, n)."""
+    """Return (1 + δ) N for δ = (xx, xz, zx, zz): (4, n)."""
     a, b, c, d = step
     xx, xz, zx, zz = N
     return np.stack([(1 + a) * xx + b * zx, (1 + a) * xz + b * zz, c * xx + (1 + d) * zx, c * xz + (1 + d) * zz])
@@ -212,7 +213,7 @@ def descend(lobes: Lobes, fit: Fit, which: np.ndarray, free: bool, stage: tuple[
 
 
 def _start(lobes: Lobes, width: np.ndarray) -> Fit:
-    """Lobes about the mean direction l̄ of the BRDF, of the size of its own.
+    """Return lobes about the mean direction l̄ of the BRDF, of the size of its own lobe.
 
     Where the NDF falls to a quarter in the angle a, its reflection does within 2 a in the plane of incidence and within
     2 a n·v across it: a lobe of GGX for a → 0, the cosine itself for a = 1.
@@ -357,13 +358,13 @@ def _stated(m: np.ndarray) -> dict[str, float]:
 
 
 def _stored(N: np.ndarray, kind: str) -> np.ndarray:
-    """Matrices as a format holds them, read again."""
+    """Return matrices after a round trip through a format."""
     with np.errstate(over="ignore"):  # what is infinite is no lobe
         return N.astype(kind).astype(np.float64)
 
 
 def _four(values: np.ndarray) -> np.ndarray:
-    """Means of neighbours on the last two axes: what is read in the middle of four texels."""
+    """Return means of neighbours on the last two axes: the values that are read in the middle of four texels."""
     down = (values[..., 1:, :] + values[..., :-1, :]) / 2
     return (down[..., 1:] + down[..., :-1]) / 2
 
@@ -447,7 +448,7 @@ def _facts(
     precision: int,
     device: Device,
 ) -> dict[str, Any]:
-    """What is misplaced by the matrices as formats hold them, and by what is read in the middle of four texels."""
+    """Return the energy misplaced by the matrices as formats hold them, and by reads in the middle of four texels."""
     flat, name = N.reshape(4, -1), f"float{precision}"
     kinds = {name: f"f{precision // 8}", "float16": "f2"}
     stated: dict[str, Any] = {held: _stated(lobes.misplaced(_stored(flat, kind))) for held, kind in kinds.items()}

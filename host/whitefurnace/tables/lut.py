@@ -294,7 +294,7 @@ def _exr(
     facts: Facts,
     transaction: Transaction,
 ) -> None:
-    """By way of a file without a name, so that a large table needs little memory."""
+    """Write an EXR by way of a nameless file, so that a large table needs little memory."""
     channels = request.shape[2] if len(request.shape) == 3 else 1
     with scratch(request.path, request.shape, request.dtype, fill) as cells:
         texts = {
@@ -321,7 +321,7 @@ def _texture(
     facts: Facts,
     transaction: Transaction,
 ) -> None:
-    """PNG, KTX 2, DDS and C, and what storing costs beside the table's error."""
+    """Write PNG, KTX 2, DDS or C. The manifest states the error of storing in addition to the table's error."""
     cells = np.empty(request.shape, request.dtype)
     fill(cells)
     whole = {**_manifest(request, key, None, made[0]), **facts}

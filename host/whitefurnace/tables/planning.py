@@ -141,7 +141,7 @@ def plan(request: TableRequest) -> TablePlan:
 
 
 def _check_file(kind: Kind, path: Path, precision: int) -> None:
-    """Raises UsageError for a file that cannot hold such a table."""
+    """Refuse a file that cannot hold such a table. Raises UsageError."""
     form = path.suffix.lower()
     if form not in FORMS:
         raise UsageError(
@@ -169,7 +169,7 @@ def _tolerance(kind: Kind, request: TableRequest) -> float:
 
 
 def _check_axes(kind: Kind, path: Path, axes: tuple[Axis, ...], request: TableRequest) -> bool:
-    """Whether reads between texels are to be measured. Raises UsageError for axes that do not serve."""
+    """Return whether reads between texels are to be measured. Raises UsageError for axes that cannot be read so."""
     if path.suffix.lower() == ".exr" and len(axes) > 2:
         raise UsageError(f"EXR holds two axes, not {len(axes)}: give .npy")
     if not axes:

@@ -124,7 +124,7 @@ def subjects(specs: Sequence[str]) -> list[Subject]:
 
 
 def _slots_of(path: str) -> list[str]:
-    """What a file defines: an NDF, a BRDF or both."""
+    """Return the slots of the models that a file defines: an NDF, a BRDF or both."""
     defined, reasons = [], []
     for slot in ("ndf", "brdf"):
         try:
@@ -182,7 +182,7 @@ def _between(p: Parameter) -> np.ndarray:
 
 
 def _few(p: Parameter) -> np.ndarray:
-    """Three values of a parameter: its ends and the middle one of the typical."""
+    """Return three values of a parameter: its ends and the middle one of its typical values."""
     return np.unique([p.low, sorted(p.typical or (p.low,))[len(p.typical) // 2], p.high])
 
 
@@ -362,7 +362,7 @@ class Bench:
 
 
 def _product(*axes: Any, columns: Columns) -> tuple[list[np.ndarray], Columns]:
-    """`axes` (1-D) times all parameter sets, flattened."""
+    """Combine `axes` (1-D each) with all parameter sets, flattened."""
     count = next((c.size for c in columns.values()), 1)
     mesh = [m.ravel() for m in np.meshgrid(*axes, np.arange(count), indexing="ij")]
     return mesh[:-1], {name: c[mesh[-1]] for name, c in columns.items()}
@@ -393,7 +393,7 @@ def _conditioned(
 
 
 def _direction(NoV: Any, phi: Any = 0.0) -> np.ndarray:
-    """(..., 3) unit vectors of a cosine and an azimuth."""
+    """Return unit vectors (..., 3) with a cosine and an azimuth."""
     NoV, phi = np.broadcast_arrays(np.asarray(NoV, np.float64), phi)
     s = np.sqrt((1 - NoV) * (1 + NoV))
     return np.stack([s * np.cos(phi), s * np.sin(phi), NoV], -1)
@@ -463,7 +463,7 @@ def _energy(b: Bench) -> Iterator[Row]:
 
 
 def _normals(b: Bench, columns: Columns) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray], Columns]:
-    """Arguments of D, as the kernel reads them, the angles they are, the steps of these by rounding."""
+    """Return arguments of D as the kernel reads them, their angles, and the steps of these by rounding."""
     if b.model.isotropic:
         (theta,), own = _product(ANGLES, columns=columns)
         arguments = [b.rounded(np.cos(theta)), b.rounded(np.sin(theta) ** 2)]
@@ -524,8 +524,10 @@ RADIAL, AZIMUTHAL = 24, 8
 
 
 def _slope_energy(b: Bench, own: dict[str, float], stretch: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
-    """Edges in ψ and the energy in each cell (ψ, φ) of the stretched slopes tan ψ (cos φ, sin φ): with
-    D cos θ dω = D cos⁴θ αx αy r dr dφ, r = tan ψ. Gauss panels graded towards both ends of ψ."""
+    """Return edges in ψ and the energy in each cell (ψ, φ) of the stretched slopes tan ψ (cos φ, sin φ).
+
+    D cos θ dω = D cos⁴θ αx αy r dr dφ, r = tan ψ. The Gauss panels are graded towards both ends of ψ.
+    """
     x, w = np.polynomial.legendre.leggauss(6)
     half = np.geomspace(1e-7, math.pi / 4, 160)
     panels = np.concatenate([[0.0], half, (math.pi / 2 - half)[-2::-1], [math.pi / 2]])
@@ -596,7 +598,7 @@ def _chi2(b: Bench) -> Iterator[Row]:
 
 
 def _samplers() -> int:
-    """Tests of one family, about: every NDF in both precisions."""
+    """Return about how many tests one family has: every NDF in both precisions."""
     return 2 * len(models("ndf"))
 
 
@@ -604,7 +606,7 @@ def _samplers() -> int:
 
 
 def _geometry(b: Bench) -> tuple[Columns, np.ndarray, np.ndarray]:
-    """Arguments of V and G for pairs of directions, areas of many roughnesses with them, as the kernel reads them."""
+    """Return arguments of V and G as the kernel reads them, for pairs of directions and areas of many roughnesses."""
     cosines = np.array([0.0, 1e-4, 1e-3, 1 / 64, 0.1, 0.4, 0.8, 1.0])
     spread = np.array([1e-4, 0.1, 0.5, 1.0])
     (NoV, NoL, phi, alpha), own = _product(
@@ -914,7 +916,7 @@ def _user_brdf_at(b: Bench, light: np.ndarray, v: np.ndarray, own: Columns) -> I
 
 
 def _kernel_light(b: Bench) -> Iterator[Row]:
-    """Its function of a direction, all around; where an edge of the light is, either side is right."""
+    """Check a light's function of a direction, all around. At an edge of the light either side is right."""
     name = next(n for n in b.model.reference if f"LIGHT_{n}" in b.model.provides)
     columns = {n: b.rounded(c) for n, c in b.columns(_typical_only).items()}
     (z, phi), own = _product(np.linspace(-1, 1, 41), np.linspace(0.05, 6.2, 61), columns=columns)

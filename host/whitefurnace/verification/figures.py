@@ -147,13 +147,13 @@ class _Family:
 
 
 def _of(label: str, entry: Model) -> bool:
-    """Whether a row's label, NAME or FILE.clh with parameters after a colon, is of this model."""
+    """Return whether a row's label, NAME or FILE.clh with parameters after a colon, names this model."""
     name = entry.path or entry.name
     return label == name or label.startswith(f"{name}:")
 
 
 def _values(entry: Model, rows: Sequence[Row]) -> dict[str, tuple[float, ...]]:
-    """What to show of each parameter: its typical values, else those of the rows, else guesses."""
+    """Return values of each parameter to show: its typical values, else those of the rows, else guesses."""
     found = {}
     for p in entry.parameters:
         # Six digits: of one value there are rows as float32 has it and as float64 does.
@@ -164,7 +164,7 @@ def _values(entry: Model, rows: Sequence[Row]) -> dict[str, tuple[float, ...]]:
 
 
 def _free(path: Path, taken: Iterable[Path]) -> Path:
-    """`path`, numbered where a model before it has the same slot and name: a user's beside ours."""
+    """Return `path`, with a number where an earlier model has the same slot and name, such as a user's and ours."""
     names, number = {p.name for p in taken}, 1
     free = path
     while free.name in names:
@@ -201,7 +201,7 @@ def _evaluate(
 
 
 def _rounded(values: Any) -> np.ndarray:
-    """As float32 has them: an error map is of the kernel, not of its input."""
+    """Return values rounded to float32, since an error map is of the kernel and not of its input."""
     return np.asarray(values, np.float32).astype(np.float64)
 
 
@@ -225,7 +225,7 @@ COSINES = np.sin(np.linspace(0.02, math.pi / 2, 97)) ** 2
 
 
 def _symbol(parameter: Parameter) -> str:
-    """A parameter's symbol, what follows the first letter of a short one below the line: αx, F82."""
+    """Return a parameter's symbol, with the letters after the first of a short one as a subscript: αx, F82."""
     short = re.fullmatch(r"([^\W\d_])([xy]|\d+)", parameter.symbol)
     return rf"$\mathrm{{{short[1]}}}_{{\mathrm{{{short[2]}}}}}$" if short else parameter.symbol
 
@@ -548,7 +548,7 @@ def _masking(sheet: _Sheet) -> Page:
 
 
 def _own(of: Model, alpha: float) -> dict[str, Any]:
-    """A masking model's parameters beside an NDF of this roughness."""
+    """Return a masking model's parameters for an NDF of this roughness."""
     return {p.name: alpha if p.name == "alpha" else p.typical[len(p.typical) // 2] for p in of.parameters}
 
 
@@ -626,7 +626,7 @@ def _fresnel_of(sheet: _Sheet, entry: Model, numbers: Numbers, theta: np.ndarray
 
 
 def _fresnel(sheet: _Sheet) -> Page:
-    """Curves over the angle for presets and for each parameter, Schlick against the exact curve, the error."""
+    """Draw curves over the angle for presets and parameters, Schlick's curve against the exact one, and the error."""
     entry = sheet.entry
     presets = {name: _preset(entry, numbers) for name, numbers in entry.presets.items()}
     metals = {name: n for name, n in presets.items() if any(np.ptp(v) > 0 for v in n.values())}
@@ -740,7 +740,9 @@ def _angles(sheet: _Sheet, family: _Family, axes: Axes) -> None:
 
 
 def _exact(sheet: _Sheet, difference: bool, axes: Axes) -> None:
-    """Schlick's curve beside the exact one of the insulator that has its f0."""
+    """Draw Schlick's curve and the exact one of the insulator that has its f0, or with `difference` their
+    difference.
+    """
     exact, usual = model("fresnel", EXACT), sheet.usual()
     values = [f0 for f0 in sheet.values["f0"] if f0 < 0.4]
     for f0, colour in zip(values, shades(len(values)), strict=True):
@@ -767,7 +769,7 @@ def _exact(sheet: _Sheet, difference: bool, axes: Axes) -> None:
 
 
 def _against_schlick(sheet: _Sheet, axes: Axes) -> None:
-    """What Schlick's curve of the same F(0°) would be off by."""
+    """Draw the error of Schlick's curve with the same F(0°)."""
     schlick = model("fresnel", SCHLICK)
     family = sheet.families()[-1]
     values = (

@@ -7,7 +7,7 @@ from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(light, view, albedo, roughness):
-    """By θd, the angle of l and the half vector: FD90 = ½ + 2 roughness cos²θd. [Burley2012, sec. 5.3]"""
+    """Evaluate by θd, the angle of l and the half vector: FD90 = ½ + 2 roughness cos²θd. [Burley2012, sec. 5.3]"""
     h = light + view
     cos_d = np.sum(light * h, -1) / np.linalg.norm(h, axis=-1)
     fd90 = 0.5 + 2 * roughness * cos_d**2
@@ -16,8 +16,12 @@ def _f(light, view, albedo, roughness):
 
 
 def _albedo(NoV, albedo, roughness):
-    """With q = FD90 - 1 = r(1 + l·v) - ½ and w = (1 - n·l)⁵, f is 1 + q(w + w_v) + q² w w_v. Over azimuth l·v has the
-    mean μμv and the variance (1 - μ²)(1 - μv²)/2; what is left is a polynomial of degree 8 in μ: 5 Gauss nodes."""
+    """Integrate the azimuth in closed form and the polar angle by Gauss nodes.
+
+    With q = FD90 - 1 = r(1 + l·v) - ½ and w = (1 - n·l)⁵, f is 1 + q(w + w_v) + q² w w_v. Over azimuth l·v has the mean
+    μμv and the variance (1 - μ²)(1 - μv²)/2. The remaining integrand is a polynomial of degree 8 in μ, so 5 Gauss nodes
+    are exact.
+    """
     x, weights = np.polynomial.legendre.leggauss(5)
     c, albedo, r = (np.asarray(a, np.float64)[..., None] for a in (NoV, albedo, roughness))
     mu, w, w_v = (x + 1) / 2, ((1 - x) / 2) ** 5, (1 - c) ** 5

@@ -16,7 +16,7 @@ def _f(light, view, albedo, f0):
 
 
 def _albedo(NoV, albedo, f0):
-    """As in the plain form: 2∫μ(1 - F)dμ = (1 - f0) 20/21."""
+    """Integrate as in the plain form: 2∫μ(1 - F)dμ = (1 - f0) 20/21."""
     return np.asarray(albedo, np.float64) * _through(NoV, f0) * (1 - np.asarray(f0)) * (20 / 21)
 
 

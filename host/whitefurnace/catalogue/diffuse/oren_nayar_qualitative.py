@@ -7,7 +7,7 @@ from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(light, view, albedo, sigma):
-    """In angles, as the paper has it."""
+    """Evaluate from angles, as in the paper."""
     theta_l, theta_v = (np.arctan2(np.hypot(d[..., 0], d[..., 1]), d[..., 2]) for d in (light, view))
     delta = np.arctan2(light[..., 1], light[..., 0]) - np.arctan2(view[..., 1], view[..., 0])
     a, b, s2 = np.maximum(theta_l, theta_v), np.minimum(theta_l, theta_v), np.square(sigma)

@@ -1,1 +1,1 @@
-"""Entries of the slot `fresnel`: one module a model, with `ENTRY`."""
+"""Entries of the slot `fresnel`: one module for each model, with `ENTRY`."""

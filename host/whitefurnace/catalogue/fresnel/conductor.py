@@ -6,7 +6,7 @@ from whitefurnace.catalogue.model import Model, Paper, Parameter
 
 
 def _f(cos_d, eta, kappa):
-    """In complex numbers: amplitudes with the root p of (η + iκ)² - sin²θ, Im p ≥ 0."""
+    """Evaluate complex amplitudes with the root p of (η + iκ)² - sin²θ, Im p ≥ 0."""
     c = np.asarray(cos_d, np.float64)
     index = np.asarray(eta, np.float64) + 1j * np.asarray(kappa, np.float64)
     index2, p = index**2, np.sqrt((index - 1) * (index + 1) + c**2)

@@ -1,1 +1,1 @@
-"""Entries of the slot `light`: one module a model, with `ENTRY`."""
+"""Entries of the slot `light`: one module for each model, with `ENTRY`."""

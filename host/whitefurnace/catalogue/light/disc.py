@@ -9,7 +9,7 @@ _FAR = 1e9
 
 
 def _l(light, center_x, center_y, center_z, normal_x, normal_y, normal_z, radius, radiance):
-    """By the distance of the ray's meeting point from the disc's axis, as a length of a cross product."""
+    """Evaluate by the distance of the ray's intersection from the disc's axis, as the length of a cross product."""
     light = np.asarray(light, np.float64)
     center = np.stack(np.broadcast_arrays(center_x, center_y, center_z), -1).astype(np.float64)
     normal = np.stack(np.broadcast_arrays(normal_x, normal_y, normal_z), -1).astype(np.float64)

@@ -9,7 +9,7 @@ from whitefurnace.catalogue.model import Model, Parameter
 
 
 def _c(normal, NoL, phi_l, color):
-    """By the polar angle and azimuth of both directions: the spherical law of cosines."""
+    """Evaluate by the polar angle and azimuth of both directions, with the spherical law of cosines."""
     normal, NoL = np.asarray(normal, np.float64), np.asarray(NoL, np.float64)
     azimuth = np.arctan2(normal[..., 1], normal[..., 0]) - phi_l
     sines = np.hypot(normal[..., 0], normal[..., 1]) * np.sin(np.arccos(NoL))

@@ -10,7 +10,7 @@ _TYPICAL = {"u": (0.5, 0.0, 0.1), "v": (0.0, -0.8, 0.2)}
 
 
 def _l(light, center_x, center_y, center_z, u_x, u_y, u_z, v_x, v_y, v_z, radiance):
-    """By solving t l = c + a u + b v for (t, a, b)."""
+    """Evaluate by solving t l = c + a u + b v for (t, a, b)."""
     light = np.asarray(light, np.float64)
     center, u, v = (
         np.stack(np.broadcast_arrays(*axes), -1).astype(np.float64)

@@ -1,1 +1,1 @@
-"""Entries of the slot `masking`: one module a model, with `ENTRY`."""
+"""Entries of the slot `masking`: one module for each model, with `ENTRY`."""

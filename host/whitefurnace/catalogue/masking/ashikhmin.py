@@ -6,7 +6,7 @@ from whitefurnace.catalogue.model import Checks, Model, Paper
 
 
 def _g(NoV, NoL, NoH, VoH, at_v, at_l):
-    """As Smith's form with Λ(c) = 1/c - 1, infinite at c = 0: 1/(1 + Λ(v) + Λ(l))."""
+    """Evaluate Smith's form 1/(1 + Λ(v) + Λ(l)) with Λ(c) = 1/c - 1, infinite at c = 0."""
     NoL = np.asarray(NoL, np.float64)
     with np.errstate(divide="ignore"):
         lambda_v, lambda_l = 1 / np.asarray(NoV, np.float64) - 1, 1 / np.where(NoL > 0, NoL, 1.0) - 1
@@ -14,7 +14,7 @@ def _g(NoV, NoL, NoH, VoH, at_v, at_l):
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l):
-    """By complements: 1/(1 - (1 - n·l)(1 - n·v)), from its logarithms, which keep what is left at grazing."""
+    """Evaluate 1/(1 - (1 - n·l)(1 - n·v)) from logarithms of the complements, which are exact at grazing angles."""
     NoV, NoL = np.asarray(NoV, np.float64), np.asarray(NoL, np.float64)
     with np.errstate(divide="ignore"):
         complements = np.log1p(-NoV) + np.log1p(-np.maximum(NoL, 0.0))

@@ -14,7 +14,7 @@ def _v(NoV, NoL, NoH, VoH, at_v, at_l):
 
 
 def _g(NoV, NoL, NoH, VoH, at_v, at_l):
-    """With 2(n·h)/(v·h) = (n·l + n·v)/(v·h)², since h is half of l + v, made long as one."""
+    """Evaluate with 2(n·h)/(v·h) = (n·l + n·v)/(v·h)², since h is (l + v)/2 scaled to unit length."""
     NoV, NoL = np.asarray(NoV, np.float64), np.asarray(NoL, np.float64)
     return np.where(NoL > 0, np.minimum(1.0, (NoL + NoV) * np.minimum(NoL, NoV) / np.square(VoH)), 0.0)
 

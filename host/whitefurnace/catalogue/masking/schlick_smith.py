@@ -13,7 +13,7 @@ def _k(alpha):
 
 
 def _g1(NoV, at_v, alpha):
-    """As 1/(1 + Λ) with Λ = k (1/c - 1), infinite at c = 0."""
+    """Evaluate 1/(1 + Λ) with Λ = k (1/c - 1), infinite at c = 0."""
     with np.errstate(divide="ignore"):
         return 1 / (1 + _k(alpha) * (1 / np.asarray(NoV, np.float64) - 1))
 

@@ -7,13 +7,13 @@ from whitefurnace.catalogue.model import Checks, Model
 
 
 def _g1(NoV, at_v):
-    """By Λ = A/(n·v) - 1, infinite at n·v = 0. [Heitz2014, eq. 43]"""
+    """Evaluate by Λ = A/(n·v) - 1, infinite at n·v = 0. [Heitz2014, eq. 43]"""
     with np.errstate(divide="ignore"):
         return 1 / (1 + (np.asarray(at_v, np.float64) / NoV - 1))
 
 
 def _g(NoV, NoL, NoH, VoH, at_v, at_l):
-    """By Λ. [Heitz2014, eq. 99]"""
+    """Evaluate by Λ. [Heitz2014, eq. 99]"""
     NoL = np.asarray(NoL, np.float64)
     with np.errstate(divide="ignore"):
         lambda_v, lambda_l = np.asarray(at_v, np.float64) / NoV - 1, np.asarray(at_l) / np.where(NoL > 0, NoL, 1.0) - 1

@@ -7,7 +7,7 @@ from whitefurnace.catalogue.model import Checks, Model
 
 
 def _g1(NoV, at_v):
-    """By Λ = A/(n·v) - 1, infinite at n·v = 0. [Heitz2014, eq. 43]"""
+    """Evaluate by Λ = A/(n·v) - 1, infinite at n·v = 0. [Heitz2014, eq. 43]"""
     with np.errstate(divide="ignore"):
         return 1 / (1 + (np.asarray(at_v, np.float64) / NoV - 1))
 

@@ -1,1 +1,1 @@
-"""Entries of the slot `ndf`: one module a model, with `ENTRY`."""
+"""Entries of the slot `ndf`: one module for each model, with `ENTRY`."""

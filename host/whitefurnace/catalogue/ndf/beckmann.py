@@ -21,7 +21,7 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
 def _d(theta_m, alpha):
-    """In slopes: P22(tan θ)/cos⁴θ with the Gaussian P22 = exp(-tan²θ/α²)/(πα²). [Heitz2014, app. A]"""
+    """Evaluate by slopes: P22(tan θ)/cos⁴θ with the Gaussian P22 = exp(-tan²θ/α²)/(πα²). [Heitz2014, app. A]"""
     theta_m = np.asarray(theta_m, np.float64)
     tan2 = np.tan(theta_m) ** 2
     return np.where(np.cos(theta_m) > 0, np.exp(-tan2 / alpha**2) / (np.pi * alpha**2) * (1 + tan2) ** 2, 0.0)

@@ -24,7 +24,7 @@ _erf = np.vectorize(math.erf, otypes=[np.float64])
 
 
 def _d(theta, phi, alpha_x, alpha_y):
-    """In slopes: D = P22/cos⁴θ, P22 = exp(-tan²θ (cos²φ/αx² + sin²φ/αy²))/(π αx αy). [Heitz2014, app. A]"""
+    """Evaluate by slopes: D = P22/cos⁴θ, P22 = exp(-tan²θ (cos²φ/αx² + sin²φ/αy²))/(π αx αy). [Heitz2014, app. A]"""
     theta, phi = np.asarray(theta, np.float64), np.asarray(phi, np.float64)
     tan2 = np.tan(theta) ** 2
     stretched = tan2 * ((np.cos(phi) / alpha_x) ** 2 + (np.sin(phi) / alpha_y) ** 2)

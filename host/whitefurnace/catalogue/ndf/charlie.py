@@ -18,7 +18,7 @@ ALPHA = Parameter(
 
 
 def _d(theta_m, alpha):
-    """(2 + 1/α)/(2π) sin^(1/α) θ with log sin θ = -½ log(1 + cot²θ). [Estevez2017]"""
+    """Evaluate (2 + 1/α)/(2π) sin^(1/α) θ with log sin θ = -½ log(1 + cot²θ). [Estevez2017]"""
     theta_m = np.asarray(theta_m, np.float64)
     with np.errstate(divide="ignore"):  # the log is -∞ along n, where D is 0
         log_sin = -0.5 * np.log1p(1 / np.tan(theta_m) ** 2)

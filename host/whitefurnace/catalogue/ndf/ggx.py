@@ -12,7 +12,7 @@ ALPHA = Parameter(
 
 
 def _d(theta_m, alpha):
-    """In slopes: D = P22(tan θ) / cos⁴θ, the GGX slope density 1/(πα²(1 + tan²θ/α²)²). [Heitz2014, app. A]"""
+    """Evaluate by slopes: D = P22(tan θ) / cos⁴θ, P22 = 1/(πα²(1 + tan²θ/α²)²). [Heitz2014, app. A]"""
     theta_m = np.asarray(theta_m, np.float64)
     tan2 = np.tan(theta_m) ** 2
     density = 1 / (np.pi * alpha**2 * (1 + tan2 / alpha**2) ** 2)

@@ -18,7 +18,7 @@ def _alpha2(phi, alpha_x, alpha_y):
 
 
 def _d(theta, phi, alpha_x, alpha_y):
-    """In slopes: D = P22/cos⁴θ, P22 = 1/(π αx αy (1 + tan²θ (cos²φ/αx² + sin²φ/αy²))²). [Heitz2014, app. A]"""
+    """Evaluate by slopes: D = P22/cos⁴θ, P22 = 1/(π αx αy (1 + tan²θ (cos²φ/αx² + sin²φ/αy²))²). [Heitz2014, app. A]"""
     theta, phi = np.asarray(theta, np.float64), np.asarray(phi, np.float64)
     tan2 = np.tan(theta) ** 2
     density = 1 / (np.pi * alpha_x * alpha_y * (1 + tan2 * _alpha2(phi, alpha_x, alpha_y)) ** 2)

@@ -20,7 +20,7 @@ _ALPHA = Parameter("alpha", "α", "1", (2 / (EXPONENT.high + 2)) ** 0.5, 1.0, ()
 
 
 def _d(theta_m, exponent):
-    """(n + 2)/(2π) cosⁿθ with log cos θ = -½ log(1 + tan²θ). [Walter2007, eq. 30]"""
+    """Evaluate (n + 2)/(2π) cosⁿθ with log cos θ = -½ log(1 + tan²θ). [Walter2007, eq. 30]"""
     theta_m = np.asarray(theta_m, np.float64)
     log_cos = -0.5 * np.log1p(np.tan(theta_m) ** 2)
     return np.where(np.cos(theta_m) > 0, (exponent + 2) / (2 * np.pi) * np.exp(exponent * log_cos), 0.0)
