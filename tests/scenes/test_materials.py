@@ -325,6 +325,38 @@ def test_charlie_is_needed_by_a_sheen_alone(tmp_path):
     assert verdicts(three)["Charlie's chain"] is None and three.cloth is None and not three.tables
 
 
+@pytest.mark.parametrize("engine", [name for name, e in ENGINES.items() if e.container == "files"])
+def test_a_table_and_a_sheen_that_do_not_go_together_are_told(tmp_path, engine):
+    """A material with sheen and a table without its channel, and the other way round: one sentence each."""
+    table = ENGINES[engine].dfg.charlie and bool(ENGINES[engine].holding("dfg"))
+    for material in (CLOTH, CHALK):
+        found = needs(scene_of(tmp_path, material), ENGINES[engine])
+        rows = [row for row in found.rows if row.what == "Charlie's albedo in the table"]
+        if material is CLOTH:
+            (row,) = rows
+            assert row.needed is (True if table else None) and "cloth has a sheen at r = 0.5" in row.reason
+            assert table or row.reason.endswith(f"no channel for it in {engine}") or "no table for it" in row.reason
+            assert found.own.dfg.charlie is ENGINES[engine].dfg.charlie
+        else:
+            assert [row.needed for row in rows] == ([False] if table else [])
+            assert all("no material has a sheen, so the table's third channel is left out" in r.reason for r in rows)
+            assert not found.own.dfg.charlie and ("sheen" in found.without) is table
+
+
+@pytest.mark.parametrize("engine", ["filament", "babylon", "khronos"])
+def test_a_sheen_alone_needs_the_table_and_the_levels_that_it_reads(tmp_path, engine):
+    """Felt that mirrors nothing: the table is for its sheen, and without Charlie's chain so are levels."""
+    felt = {
+        **CLOTH,
+        "extensions": {**CLOTH["extensions"], **with_extension("specular", specularFactor=0)["extensions"]},
+    }
+    found = needs(scene_of(tmp_path, felt), ENGINES[engine])
+    said = verdicts(found)
+    assert said["split-sum table"] and said["Charlie's albedo in the table"] and "dfg" not in found.without
+    reads = [row for row in found.rows if row.kind == "level" and "of reads: cloth" in row.reason]
+    assert bool(reads) is (engine != "khronos")
+
+
 def test_a_clear_coat_reads_at_its_own_roughness(tmp_path):
     coated = {"name": "paint", **CHALK, **with_extension("clearcoat", clearcoatFactor=1, clearcoatRoughnessFactor=0.03)}
     scene = scene_of(tmp_path, coated)

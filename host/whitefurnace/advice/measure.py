@@ -339,10 +339,16 @@ class ErrorMeter:
             for name in models("masking")
             if name != "smith"
         ]
-        if (sheen := integrals.sheen()) is not None:
+        masking = self.reads.engine.dfg.charlie_masking
+        if (sheen := integrals.sheen(masking)) is not None:
+            title = models("masking")[masking].title
             found.append(
                 self.entry(
-                    "split sum of sheen", "other", sheen, "Charlie's lobe from n = v = r, Smith's masking", used=False
+                    "split sum of sheen",
+                    "other",
+                    sheen,
+                    f"Charlie's lobe from n = v = r, masked by {title}",
+                    used=False,
                 )
             )
         return tuple(found)

@@ -214,6 +214,10 @@ class _Deciding:
         self.diffuse = [(m.name, diffuse_weight(engine, m)) for m in self.lit]
         self.needs_diffuse = any(w > NEGLIGIBLE for _, w in self.diffuse)
         self.needs_chain = bool(self.lobes)
+        tabled = bool(self.sheens) and engine.dfg.charlie
+        self.tabled_sheens = self.sheens if tabled and engine.holding("dfg") else []
+        # An engine that has no chain of Charlie's reads its specular chain for a sheen.
+        self.readers = [*self.lobes, *(self.sheens if tabled and not engine.holding("sheen") else [])]
         self.rows: list[Need] = []
 
     def made(self) -> Needs:
@@ -243,6 +247,7 @@ class _Deciding:
         own = reduced(engine, without, table)
         self._levels(own, own_chain)
         self._integrals(own, own_chain)
+        self._sheen_channel()
         tables = tuple(self._tables())
         cloth = self._cloth()
         self._effects()
@@ -279,7 +284,7 @@ class _Deciding:
                 yield "sh"
         if not self.sheens and (engine.holding("sheen") or (engine.dfg.charlie and engine.holding("dfg"))):
             yield "sheen"
-        if not self.needs_chain and engine.needs("dfg"):
+        if not (self.needs_chain or self.tabled_sheens) and engine.needs("dfg"):
             yield "dfg"
         if not self.background and engine.holding("skybox"):
             yield "skybox"
@@ -297,18 +302,18 @@ class _Deciding:
                 self.rows.append(Need("specular chain", "lobe", False, f"{engine.name} filters the image itself"))
             return
         before, after = _parts(engine, full).get("specular", 0), _parts(own, made).get("specular", 0)
-        shares = read_shares(self.lobes, full) if self.lobes else np.zeros(len(full.levels))
+        shares = read_shares(self.readers, full) if self.readers else np.zeros(len(full.levels))
         usual, here = (sum(s * s for s, _ in c.levels) for c in (full, made))
         made_of = range(made.first, made.first + len(made.levels))
         for k, (size, r) in enumerate(full.levels):
             last = k == len(full.levels) - 1 and self._last_is_diffuse()
             if shares[k] > 0:
                 first = min(
-                    (lobe for lobe in self.lobes if read_shares([lobe], full)[k] > 0),
+                    (lobe for lobe in self.readers if read_shares([lobe], full)[k] > 0),
                     key=lambda lobe: lobe.roughness.least,
                 )
                 reason = f"{shares[k]:.2g} of reads: " + _some(
-                    sorted({lobe.material for lobe in self.lobes if read_shares([lobe], full)[k] > 0})
+                    sorted({lobe.material for lobe in self.readers if read_shares([lobe], full)[k] > 0})
                 )
                 reason += f", from r = {first.roughness.least:.2g}" if k == int(np.argmax(shares > 0)) else ""
             elif last:
@@ -377,10 +382,10 @@ class _Deciding:
             row("sheen", "Charlie's chain", "lobe", bool(self.sheens), _sheen_text(self.sheens))
         if not engine.needs("dfg"):
             return
-        if not self.needs_chain:
+        if not (self.needs_chain or self.tabled_sheens):
             row("dfg", "split-sum table", "table", False, "no surface reflects")
             return
-        least = min(lobe.roughness.least for lobe in self.lobes)
+        least = min(lobe.roughness.least for lobe in self.lobes or self.tabled_sheens)
         size = engine.dfg.size if engine.container == "files" else DFG_SIZE
         reason = f"every reflection reads it, from r = {least:.2g}"
         if own.dfg.size != engine.dfg.size:
@@ -390,8 +395,18 @@ class _Deciding:
                 f"{engine.dfg.size}²; --table {size}"
             )
         row("dfg", f"split-sum table, {size}²", "table", True, reason)
+
+    def _sheen_channel(self) -> None:
+        """Adds a row for the albedo of a sheen in the engine's table, where the table or a material has one."""
+        engine, text = self.engine, _sheen_text(self.sheens)
         if engine.dfg.charlie and engine.holding("dfg"):
-            self.rows.append(Need("Charlie's albedo in it", "table", bool(self.sheens), _sheen_text(self.sheens)))
+            left = "" if self.sheens else ", so the table's third channel is left out"
+            self.rows.append(Need("Charlie's albedo in the table", "table", bool(self.sheens), text + left))
+        elif self.sheens and engine.container == "files":
+            table = "table has no channel" if engine.holding("dfg") else "files have no table"
+            self.rows.append(
+                Need("Charlie's albedo in the table", "table", None, f"{text}, and the {table} for it in {engine.name}")
+            )
 
     def _tables(self) -> Iterator[dict[str, Any]]:
         """Options of `lut` for tables that the engine does not have, for users' own renderers."""
@@ -455,7 +470,8 @@ class _Deciding:
                         "Charlie's chain",
                         "lobe",
                         None,
-                        f"{_sheen_text(self.sheens)}; {self.engine.name} reads no such chain",
+                        f"{_sheen_text(self.sheens)}; {self.engine.name} reads no such chain"
+                        + (f": it shades sheen by {self.engine.sheen}" if self.engine.sheen else ""),
                     )
                 )
             return None

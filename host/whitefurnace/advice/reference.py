@@ -238,8 +238,8 @@ class PointIntegrals:
             out[g.index] = rest[g.index] * (a * c + (full - a) * c * c - c * self.diffuse[g.index])
         return out
 
-    def sheen(self) -> np.ndarray | None:
-        """Return the error that the split sum of Charlie's lobe makes on the materials that have a sheen, (m, 3).
+    def sheen(self, masking: str) -> np.ndarray | None:
+        """Return the error (m, 3) that the split sum of Charlie's lobe under a masking makes on materials with a sheen.
 
         None where no point has a sheen.
         """
@@ -252,7 +252,8 @@ class PointIntegrals:
             m = self.scene.materials[k]
             r = max(float(middle(m["sheen_roughness"])[0]), 0.1)
             points = self.points.some(index)
-            R, E = self.truth.reflected(term(ndf="charlie", roughness=r), points, self._least_count)
+            cloth = term(ndf="charlie", roughness=r, masking=masking, **_following(masking, r))
+            R, E = self.truth.reflected(cloth, points, self._least_count)
             d = mirrored(points)
             levels, own = self.truth.reflected(
                 term(ndf="charlie", roughness=r, masking="implicit"), Points(d, d), self._least_count
@@ -268,7 +269,11 @@ def mirrored(points: Points) -> np.ndarray:
 
 def _schlick(r: float, masking: str = "smith") -> Term:
     """GGX of roughness r with Schlick's Fresnel term, in two variants: F0 = 0 and F0 = 1."""
+    f0 = np.array([0.0, 1.0])
+    return term(ndf="ggx", roughness=r, masking=masking, fresnel="schlick", fresnel_f0=f0, **_following(masking, r))
+
+
+def _following(masking: str, r: float) -> dict[str, Any]:
+    """The parameters of a masking that follow roughness, as `term` takes them."""
     follows = models("masking")[masking].from_roughness
-    given = follows(r) if follows and r > 0 else {}
-    own: dict[str, Any] = {f"masking_{name}": value for name, value in given.items()}
-    return term(ndf="ggx", roughness=r, masking=masking, fresnel="schlick", fresnel_f0=np.array([0.0, 1.0]), **own)
+    return {f"masking_{name}": value for name, value in follows(r).items()} if follows and r > 0 else {}

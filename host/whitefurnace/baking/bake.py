@@ -750,7 +750,7 @@ def _programs(request: BakePlan, env: Environment) -> tuple[Program, ...]:
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
     # What no engine has at all is made of no program.
     chains = [want.recipe for want in wants if (want.cubes, want.latlongs, want.octahedral) != (0, 0, 0)]
-    charlie = any(engine.dfg.charlie and engine.holding("dfg") for engine in request.engines)
+    charlie = [e.dfg.charlie_masking for e in request.engines if e.dfg.charlie and e.holding("dfg")]
     return programs(chains or [wants[0].recipe], env.kind, texel, demo=env.name == DEMO, charlie=charlie)
 
 

@@ -49,12 +49,12 @@ class Program:
 
 
 def programs(
-    chains: Sequence[Chain], kind: str, texel: float, *, demo: bool = False, charlie: bool = False
+    chains: Sequence[Chain], kind: str, texel: float, *, demo: bool = False, charlie: Sequence[str] = ()
 ) -> tuple[Program, ...]:
     """Return the programs that a bake builds, with those of the split-sum table; equal texts appear once.
 
     chains: chains of the engines. kind: "latlong" or "cube". texel: width of a source texel in radians. demo: True if
-    the built-in environment is made. charlie: True if a table has Charlie's albedo.
+    the built-in environment is made. charlie: maskings of Charlie's albedo in the engines' tables.
     """
     found: dict[str, Program] = {}
     for one in _programs(chains, kind, texel, demo, charlie):
@@ -64,7 +64,9 @@ def programs(
     return tuple(found.values())
 
 
-def _programs(chains: Sequence[Chain], kind: str, texel: float, demo: bool, charlie: bool) -> Iterator[Program]:
+def _programs(
+    chains: Sequence[Chain], kind: str, texel: float, demo: bool, charlie: Sequence[str]
+) -> Iterator[Program]:
     if demo:
         yield Program("built-in environment", source.demo())
     yield Program(f"nodes and harmonics of a {kind}", source.texels(kind))
@@ -97,8 +99,8 @@ def _programs(chains: Sequence[Chain], kind: str, texel: float, demo: bool, char
     )
     yield Program("bright texels under the cosine", source.apart(None), "where texels stand out")
     yield from _integrated("dfg", chains[0].ndf.model)
-    if charlie:
-        yield from _integrated("albedo", model("ndf", "charlie"))
+    for masking in charlie:
+        yield from _integrated("albedo", model("ndf", "charlie"), masking)
 
 
 def _derived(entry: Model) -> Iterator[Program]:
@@ -108,17 +110,17 @@ def _derived(entry: Model) -> Iterator[Program]:
         yield Program(f"{one.title} of {entry.name}", source.integration(one, {"ndf": entry}))
 
 
-def _integrated(name: str, ndf: Model) -> Iterator[Program]:
-    """Programs of an integral over an NDF with Smith's masking and white Fresnel, as `integrate` builds them."""
+def _integrated(name: str, ndf: Model, masking: str = "smith") -> Iterator[Program]:
+    """Programs of an integral over an NDF with a masking and white Fresnel, as `integrate` builds them."""
     entry = integral(name)
-    slots = {"ndf": ndf, "masking": model("masking", "smith")}
+    slots = {"ndf": ndf, "masking": model("masking", masking)}
     if name != "dfg":
         slots["fresnel"] = model("fresnel", "one")
     own = own_kernel_of(entry, slots)
     if own:
         yield Program(f"{name} of {ndf.name}", source.closed(own, slots))
         return
-    tabled = "NDF_AREA" not in ndf.provides
+    tabled = "NDF_AREA" in slots["masking"].needs and "NDF_AREA" not in ndf.provides
     yield Program(
         f"{name} of {ndf.name}",
         source.integration(entry, slots, LEAST_TERMS if tabled else 0),

@@ -80,7 +80,11 @@ def engine_text(engine: Engine) -> str:
         lines += [f"  least r    {engine.least:g}"] if engine.least else []
         lines += [f"  harmonics  {engine.sh}"] if engine.sh else []
         d = engine.dfg
-        lines += [f"  table      {d.size}², x = {d.x}, y = {d.y}, {d.form}" + (", Charlie" if d.charlie else "")]
+        lines += [
+            f"  table      {d.size}², x = {d.x}, y = {d.y}, {d.form}"
+            + (f", Charlie × {d.charlie_masking}" if d.charlie else "")
+        ]
+        lines += [f"  sheen      {engine.sheen}"] if engine.sheen else []
         lines += [
             f"  file       {file.name.replace('{stem}', 'STEM')}: {file.holds}, {file.stored}" for file in engine.file
         ]

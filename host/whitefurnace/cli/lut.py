@@ -29,6 +29,7 @@ Examples:
   whitefurnace lut energy -o energy.npy --size 64 --scheme turquin
   whitefurnace lut ltc -o ltc.npy
   whitefurnace lut glass -o glass.ktx2 --size 32
+  whitefurnace lut sheen -o cloth.npy --masking ashikhmin
   whitefurnace lut smith -o smith.h --ndf abc:c=1.5
   whitefurnace lut diffusion -o skin.png --size 256
   whitefurnace lut albedo -o gold.exr --fresnel schlick:gold --size 64x32
@@ -68,7 +69,7 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of t
     "for_",
     metavar="ENGINE",
     heading=OUTPUT,
-    help="Use the size, axes and form that an engine reads (see `whitefurnace engines`). Of dfg.",
+    help="Use the size, axes, form and sheen that an engine reads (see `whitefurnace engines`). Of dfg and sheen.",
 )
 @options.option(
     "--scheme",

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import msgspec
 
+from whitefurnace.catalogue import models
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.expression import Expression, table_text
 from whitefurnace.prefiltering.recipe import LOD_NAMES, Lods
@@ -99,6 +100,7 @@ class Dfg(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     NoV      spacing of NoV: "centres" has values at texel centres, "sqrt" has √NoV with its ends on texels
     form     "scale_bias" for (scale, bias), or "multiscatter" for (∫Fc, ∫1)
     charlie  True if Charlie's albedo is a third channel
+    charlie_masking  masking of Charlie's albedo; Neubelt's V is that of Filament, Babylon.js and Khronos' sampler
     """
 
     size: int = 128
@@ -107,6 +109,7 @@ class Dfg(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     NoV: Literal["centres", "sqrt"] = "centres"
     form: Literal["scale_bias", "multiscatter"] = "scale_bias"
     charlie: bool = False
+    charlie_masking: str = "ashikhmin"
 
 
 class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
@@ -125,7 +128,8 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
     levels: number of levels, where the engine requires a fixed number.
     whole: True if the engine needs all mips down to 1².
     sh: scale of its harmonics, one of SH_SCALES; None where it uses none.
-    dfg: its split-sum table. shading: the formula with which it weights what it reads.
+    dfg: its split-sum table. shading: the formula with which it weights what it reads. sheen: words for how it shades
+    a sheen.
     file: its files. steps: what a user does with them.
     container: "files", or "npz" and "exr", which hold everything and need no `file`. latlong: True if lat-long levels
     are needed too.
@@ -149,6 +153,7 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
     sh: Literal["filament", "babylon", "irradiance", "radiance"] | None = None
     dfg: Dfg = Dfg()
     shading: Literal["split_sum", "scaled", "babylon", "fdez_aguera", "khronos"] = "split_sum"
+    sheen: str = ""
     file: tuple[File, ...] = ()
     steps: tuple[str, ...] = ()
     container: Literal["npz", "exr", "files"] = "files"
@@ -342,6 +347,11 @@ def check(engine: Engine) -> None:
             raise UsageError(f"{what} {value} is outside [{low}, {high}]")
     if (engine.dfg.x == "NoV") == (engine.dfg.y == "NoV"):
         raise UsageError(f"dfg has x = {engine.dfg.x} and y = {engine.dfg.y}; one of them must be NoV, the other not")
+    if engine.dfg.charlie_masking not in models("masking"):
+        raise UsageError(
+            f"dfg.charlie_masking: unknown masking {engine.dfg.charlie_masking!r}"
+            f"{nearest(engine.dfg.charlie_masking, models('masking'))}"
+        )
     if engine.whole and engine.min_size != 1:
         raise UsageError(f"min_size {engine.min_size}: `whole` chains go down to 1")
     seen: set[str] = set()

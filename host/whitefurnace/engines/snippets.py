@@ -386,7 +386,7 @@ def _split_sum(to: _Writer, engine: Engine) -> None:
         [],
         f"{to.read('dfg_map', at, '0.0')}.{channels}",
         {"scale_bias": "(A, B", "multiscatter": "(of Fc, of 1"}[table.form]
-        + (", Charlie's albedo)" if table.charlie else ")"),
+        + (f", Charlie's albedo under {table.charlie_masking})" if table.charlie else ")"),
     )
     scaled = table.form == "scale_bias"
     ones = [to.vector(f"t.{c}", f"t.{c}", f"t.{c}") for c in "xy"]

@@ -156,21 +156,27 @@ def _apart(values: np.ndarray) -> float:
 def sheen(report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
     """Albedo E(v) and its average E_avg, (…, 2), of a sheen of colour 1, which scale the layer below. [Estevez2017]
 
-    what: arguments of `integrate`. Raises UnsupportedError for a sheen that reflects more than arrives.
+    what: arguments of `integrate`. A sheen that reflects more than arrives somewhere is told in a notice.
     """
     own = {**what, "out": None}
     E = integrate("albedo", **own)
     mean = integrate("albedo_average", **{k: v for k, v in _without_view(own).items() if k != "backfacing"})
-    if report and E.values.max() > 1 + E.error:
-        raise UnsupportedError(
-            f"a sheen that reflects {E.values.max():.4g} of what arrives leaves less than nothing "
-            "to what lies under it; smith has albedos of at most 1"
-        )
     made = replace(_joined(E, mean), values=_whole(what["out"], (E.values, mean.values), what["precision"]))
+    largest, over = float(E.values.max()), float((E.values > 1 + E.error).mean())
+    if report and over:
+        made = replace(
+            made,
+            notices=(
+                *made.notices,
+                f"this sheen reflects up to {largest:.3g} times what arrives, over 1 in {over:.1%} of the cells, where "
+                "the scale of the layer below is 0; under the masking smith no albedo passes 1",
+            ),
+        )
     return made, {
         "channels": ["E", "E_avg"],
-        "largest": float(E.values.max()),
-        "formula": "f_sheen + f_base min(1 - s E(v), 1 - s E(l)), s the largest channel of its colour",
+        "largest": largest,
+        "over_one": over,
+        "formula": "f_sheen + f_base max(0, min(1 - s E(v), 1 - s E(l))), s the largest channel of its colour",
     }
 
 

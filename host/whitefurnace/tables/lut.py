@@ -122,7 +122,7 @@ def lut(
     fit: "bilinear" fits the texels so that reads between them are most accurate. as_read: measure the error of such
         reads; a fit does.
     scheme: form of the table, where its kind has several. stored: pixel format, such as "rg16f" or "r8".
-    for_: an engine, which decides size, axes and scheme of "dfg".
+    for_: an engine, which decides size, axes and scheme of "dfg", and size, axes and masking of "sheen".
     force: overwrite files that this tool did not write.
     parameters, fixed: parameters that stay at one number, as a mapping or by name.
     device: an OpenCL device or a part of its name. dry_run: check everything and write nothing. progress: called with

@@ -19,7 +19,7 @@ TOLERANCE = 5e-6
 """Tolerance of the pairs of a bake; half floats have steps of 2.4e-4."""
 
 CHARLIE = 1e-4
-"""Least tolerance of Charlie's albedo: its error as half is 2e-4."""
+"""Least tolerance of Charlie's albedo: its error as half is 2e-4, of values up to 10 near grazing."""
 
 CHANNELS: Mapping[str, tuple[tuple[str, str], str]] = {
     "scale_bias": (("scale", "bias"), "E(v; F0) = F0 scale + bias"),
@@ -75,9 +75,9 @@ def laid_out(
     ), float(own.error)
 
 
-def charlie(cells: Cells) -> dict[str, Any]:
-    """Return Charlie's lobe with the masking of a table, and its parameters over the same cells."""
-    models: dict[str, Chosen] = {"ndf": chosen("ndf", "charlie"), "masking": cells.models["masking"]}
+def charlie(cells: Cells, masking: str) -> dict[str, Any]:
+    """Return Charlie's lobe with a masking, and their parameters over the cells of a table."""
+    models: dict[str, Chosen] = {"ndf": chosen("ndf", "charlie"), "masking": chosen("masking", masking)}
     return {**models, **cells.columns_for(models)}
 
 
@@ -92,7 +92,11 @@ def axis_values(name: str, spacing: str, size: int) -> np.ndarray:
 
 
 def split_sum(table: Dfg, *, device: Device, ndf: Spec = "ggx", masking: Spec = "smith") -> SplitSum:
-    """Compute the split-sum table of an engine, in float32. Raises the errors of `integrate`."""
+    """Compute the split-sum table of an engine, in float32.
+
+    ndf, masking: models of the first two channels; Charlie's albedo has the masking of `table`. Raises the errors of
+    `integrate`.
+    """
     x, y = (axis_values(name, table.NoV, table.size) for name in (table.x, table.y))
     across = {
         table.x: np.broadcast_to(x[None], (table.size, table.size)),
@@ -100,16 +104,14 @@ def split_sum(table: Dfg, *, device: Device, ndf: Spec = "ggx", masking: Spec = 
     }
     roughness = across["roughness"] if "roughness" in across else np.sqrt(across["alpha"])
 
-    def of(spec: Spec) -> dict[str, Any]:
-        choice = chosen("ndf", spec)
-        return {
-            "ndf": choice,
-            "masking": masking,
-            "tolerance": TOLERANCE,
-            "device": device,
-            "NoV": across["NoV"],
-            **rows_of_roughness(choice, roughness),
-        }
+    def of(ndf: Spec, masking: Spec) -> dict[str, Any]:
+        models = {"ndf": chosen("ndf", ndf), "masking": chosen("masking", masking)}
+        rows: dict[str, Any] = {}
+        for choice in models.values():
+            if choice.model.from_roughness is not None:
+                rows |= rows_of_roughness(choice, roughness)
+        return {**models, "tolerance": TOLERANCE, "device": device, "NoV": across["NoV"], **rows}
 
-    made, charlie_error = laid_out(table.form, of(ndf), of("charlie") if table.charlie else None)
+    cloth = of("charlie", table.charlie_masking) if table.charlie else None
+    made, charlie_error = laid_out(table.form, of(ndf, masking), cloth)
     return SplitSum(made.values, made.error, charlie_error, made.rule, made.notices)

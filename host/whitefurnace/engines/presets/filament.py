@@ -18,6 +18,7 @@ PRESET = Preset(
         sh="filament",
         dfg=Dfg(128, form="multiscatter", charlie=True),
         shading="scaled",
+        sheen="Charlie under Neubelt's V, its table's third channel, in the light of the specular chain",
         file=(
             File("specular", "{stem}_ibl.ktx", "b10g11r11"),
             File("skybox", "{stem}_skybox.ktx", "b10g11r11"),

@@ -14,6 +14,8 @@ PRESET = Preset(
         min_size=4,
         dfg=Dfg(128, charlie=True),
         shading="khronos",
+        sheen="Charlie under Neubelt's V, its table's third channel, in the light of Charlie's chain; with Estevez "
+        "and Kulla's fitted Λ in the light of lamps",
         file=(
             File("specular", "{stem}_ggx.ktx2", "rgba16f", 19),
             File("irradiance", "{stem}_lambertian.ktx2", "rgba16f", 19),

@@ -19,6 +19,7 @@ PRESET = Preset(
         min_size=8,
         dfg=Dfg(16, x="roughness", y="NoV"),
         shading="fdez_aguera",
+        sheen="a fit of its own (IBLSheenBRDF), in the light of the irradiance",
         file=(
             File("specular", "{stem}.ktx2", "rgba16f", 19),
             File("environment", "{stem}.hdr"),

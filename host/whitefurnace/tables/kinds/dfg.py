@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from whitefurnace.errors import UsageError
+from whitefurnace.tables.engine_axes import arranged, axes_of, engine_of
 from whitefurnace.tables.kind import Facts
 from whitefurnace.tables.kinds.integrals import OfIntegral
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from whitefurnace.engines.presets import Dfg
     from whitefurnace.integrals.quadrature import TableSpec
     from whitefurnace.results import Integrated
-    from whitefurnace.tables.axes import Axis, AxisSpec
+    from whitefurnace.tables.axes import Axis
     from whitefurnace.tables.cells import Cells, Run
     from whitefurnace.tables.request import TableRequest
 
@@ -32,39 +32,25 @@ class SplitSum(OfIntegral):
     def settled(self, request: TableRequest) -> tuple[SplitSum, TableRequest]:
         if request.for_ is None:
             return self, request
-        from whitefurnace.engines.presets import engines
-
-        found = engines(request.for_)
-        if len(found) > 1:
-            raise UsageError(f"{request.for_}: a table is for one engine")
-        for what, value in (("size", request.size), ("axis", request.axes), ("scheme", request.scheme)):
-            if value:
-                raise UsageError(f"--for {found[0].name} says the {what}: leave it out")
-        table = found[0].dfg
-        axes: dict[str, AxisSpec] = {
-            name: (0.0, 1.0, table.size, table.NoV if name == "NoV" else "centres") for name in (table.x, table.y)
-        }
-        return replace(self, engine=table), replace(request, size=table.size, scheme=table.form, axes=axes)
+        table = engine_of(request, ("size", "axis", "scheme")).dfg
+        return replace(self, engine=table), replace(request, size=table.size, scheme=table.form, axes=axes_of(table))
 
     def arranged(self, axes: tuple[Axis, ...]) -> tuple[Axis, ...]:
-        if self.engine is None:
-            return axes
-        order = (self.engine.x, self.engine.y)
-        return tuple(sorted(axes, key=lambda one: order.index(one.name)))
+        return arranged(self.engine, axes)
 
     @property
-    def charlie(self) -> bool:
-        """True if the table has Charlie's albedo as a third channel."""
-        return self.engine is not None and self.engine.charlie
+    def charlie(self) -> str | None:
+        """Masking of Charlie's albedo, the third channel of the table; None for a table without one."""
+        return self.engine.charlie_masking if self.engine is not None and self.engine.charlie else None
 
     def spec(self, cells: Cells) -> TableSpec:
         from whitefurnace.integrals.quadrature import table_spec
         from whitefurnace.tables.split_sum import charlie
 
         found = super().spec(cells)
-        if not self.charlie:
+        if self.charlie is None:
             return found
-        cloth: dict[str, Any] = charlie(cells)
+        cloth: dict[str, Any] = charlie(cells, self.charlie)
         return replace(
             found, shape=(*found.shape[:-1], 3), digests=(*found.digests, *table_spec("albedo", **cloth).digests)
         )
@@ -73,19 +59,25 @@ class SplitSum(OfIntegral):
         from whitefurnace.tables.split_sum import CHANNELS, charlie, laid_out
 
         form = cells.scheme or self.schemes[0]
-        cloth = {**charlie(cells), "backfacing": cells.backfacing, **run.arguments} if self.charlie else None
+        cloth = (
+            {**charlie(cells, self.charlie), "backfacing": cells.backfacing, **run.arguments} if self.charlie else None
+        )
         made, charlie_error = laid_out(form, {**cells.arguments, **run.arguments}, cloth, run.progress)
         channels, formula = CHANNELS[form]
         facts: Facts = {"channels": list(channels), "formula": formula}
         if cloth is not None:
-            facts |= {"channels": [*channels, "charlie"], "charlie_error": charlie_error}
+            facts |= {
+                "channels": [*channels, "charlie"],
+                "charlie_masking": self.charlie,
+                "charlie_error": charlie_error,
+            }
         return made, facts if report else {}
 
     def facts(self, cells: Cells, run: Run) -> Facts:
         return self.make(cells, run, True)[1]
 
     def recipe(self) -> dict[str, Any]:
-        return {"charlie": True} if self.charlie else {}
+        return {"charlie": self.charlie} if self.charlie else {}
 
 
 KINDS = (SplitSum(),)
