@@ -287,7 +287,7 @@ def bake(
         "normal" (1e-3), "reference" (2e-5); or samples, 1 to 65536, for filtered importance sampling.
     certify: texels of each level whose error is measured, 299 to 1048576.
     fit: "read" fits the levels to how they are interpolated. as_read: measure the error after the engine's sampling.
-    rotate: degrees about +Y, from +X towards +Z. exposure: stops. nonfinite: "refuse" or "zero". sun: "keep", "extract" or "clamp=X".
+    rotate: degrees about +Y. exposure: stops. nonfinite: "refuse" or "zero". sun: "keep", "extract" or "clamp=X".
     sh: "window=auto", "window=none" or "window=X", the window of engines' irradiance harmonics.
     force: bake again, and replace files that are not known to be ours.
     device: a `Device`, or a number or part of a name. dry_run: only return the plan.
