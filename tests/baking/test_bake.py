@@ -449,7 +449,7 @@ def test_a_model_from_a_file(tmp_path, shell):
         (MY_GGX.replace("my_lobe", "other"), ":scale=3", 3, "ndf_my_lobe_D"),
         (MY_GGX.replace("scale *", "-scale *"), ":scale=3", 3, "negative"),
         ("real ndf_my_lobe_D(real cos_m, real a) { return a; }", ":a=1", 5, "roughness"),
-        ("real ndf_my_lobe_D(real cos_m, real alpha) { return cosm; }", "", 4, "cosm"),
+        ("real ndf_my_lobe_D(real cos_m, real alpha) { return cosm; }", "", 3, "cosm"),
     ],
     ids=[
         "parameter missing",

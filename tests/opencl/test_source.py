@@ -53,7 +53,7 @@ def test_every_program_is_made_of_files_that_exist() -> None:
             used |= {file for file in files if (KERNELS / file).is_file()}
             assert word or files[0] in used, f"{name}: {piece}"
     there = {path.relative_to(Path(str(KERNELS))).as_posix() for path in Path(str(KERNELS)).rglob("*.cl*")}
-    generated = {entry.kernel_file for entry in MODELS} | {"special.clh", "area_table.clh", "probe.cl"}
+    generated = {entry.kernel_file for entry in MODELS} | {"special.clh", "user.clh", "area_table.clh", "probe.cl"}
     assert there == used | generated
 
 

@@ -115,8 +115,9 @@ class Model:
     presets: named parameter sets, RGB as three numbers.
     limits: exact values by name. Each is a function from the parameters to the argument of the reference and its value
     there, NaN where there is none.
-    text, path, takes_sin2: only for a model from a user's file: its kernel text, the path of the file, and True if its
-    D takes sin²θ. Models of the catalogue have a kernel file instead.
+    text, path, function, takes_sin2: for a model from a user's file, its text translated for kernels (`user_text`), the
+    path of the file, the name of its function, and whether its D takes sin²θ. Models of the catalogue have a kernel
+    file instead.
     """
 
     slot: str
@@ -139,6 +140,7 @@ class Model:
     limits: Mapping[str, Callable[..., tuple[Any, Any]]] = field(default_factory=dict)
     text: str | None = None
     path: str | None = None
+    function: str = ""
     takes_sin2: bool = True
 
     @property

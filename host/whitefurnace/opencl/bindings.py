@@ -145,7 +145,7 @@ def _function_lines(slot: str, entry: Model, function: str, isotropic: bool) -> 
     known = FUNCTIONS[function]
     dummies = [f"a{k}" for k in range(len(known.kinds(isotropic)))]
     passed = dummies[:1] if function == "NDF_D" and not entry.takes_sin2 else dummies
-    target = f"{slot}_{entry.name}_{known.ending}"
+    target = f"{slot}_{entry.name}_{known.ending}" if entry.text is None else f"lanes_{slot}"
     if slot in SELF_CONTAINED:
         call = f"{target}({', '.join([*passed, *(f'{slot}_{n}' for n in entry.passed(function))])})"
     else:
@@ -160,6 +160,41 @@ def _function_lines(slot: str, entry: Model, function: str, isotropic: bool) -> 
         else "#define NDF_D(a0) ((a0).z > 0 ? NDF_D_FRONT(a0) : (real)0)"
     )
     return [front, f"#define NDF_D_FRONT{head} ({'' if entry.text is None else 'ndf_per_norm * '}{call})"]
+
+
+def lanes(entry: Model) -> str:
+    """Return the function `lanes_SLOT` that calls the function of a user's file for each lane by itself.
+
+    The compiler makes vectors of the loop where it can: a function without branches takes the time of explicit lanes. A
+    D is called where n·m is in (0, 1] alone, since a square root or an index of the user's may fail elsewhere.
+    """
+    kinds = list(FUNCTIONS[entry.provides[0]].parameters.values())
+    if entry.slot == "ndf" and not entry.takes_sin2:
+        kinds.pop()
+    kinds += [NUMBER for _ in entry.parameters]
+    rows: list[str] = []  # the numbers that a lane takes
+    values: list[str] = []  # the arguments of the user's function, made of them
+    for place, kind in enumerate(kinds):
+        parts = [f"a{place}.{axis}" for axis in "xyz"] if kind is VECTOR else [f"a{place}"]
+        taken = [f"in[{len(rows) + k}][k]" for k in range(len(parts))]
+        rows += parts
+        values.append(f"(scalar3)({', '.join(taken)})" if kind is VECTOR else taken[0])
+    call = f"own_{entry.function}({', '.join(values)})"
+    declared = ", ".join(f"real{'3' if kind is VECTOR else ''} a{place}" for place, kind in enumerate(kinds))
+    loads = " ".join(f"USER_LANES({row}, in[{k}]);" for k, row in enumerate(rows))
+    if entry.slot == "ndf":
+        outputs, result = 1, "real"
+        body = f"in[0][k] = fmin(in[0][k], (scalar)1); out[0][k] = in[0][k] > 0 ? {call} : (scalar)0;"
+        returned = "USER_REAL(out[0])"
+    else:
+        outputs, result = 3, "real3"
+        body = f"const scalar3 f = {call}; out[0][k] = f.x; out[1][k] = f.y; out[2][k] = f.z;"
+        returned = "vec3(USER_REAL(out[0]), USER_REAL(out[1]), USER_REAL(out[2]))"
+    return (
+        f"static inline {result} lanes_{entry.slot}({declared}) {{\n"
+        f"  scalar in[{len(rows)}][W], out[{outputs}][W];\n  {loads}\n"
+        f"  for (int k = 0; k < W; k++) {{ {body} }}\n  return {returned};\n}}\n"
+    )
 
 
 def _default_lines(slots: Mapping[str, Model], isotropic: bool, tabled: bool) -> list[str]:

@@ -103,8 +103,8 @@ def _norm_and_width(device: Device, entry: Model, distinct: np.ndarray) -> np.nd
     if not (np.abs(fine - coarse) <= CONVERGED * np.abs(fine)).all():
         raise InputError(
             f"{entry.path}: cannot be normalized: ∫ D(m)(n·m) dω does not converge (two fine rules give "
-            f"{coarse.max():.4g} and {fine.max():.4g}); D must grow slower than 1/cos²θ at grazing and be "
-            "wider than 1e-6 rad"
+            f"{coarse.max():.4g} and {fine.max():.4g}); D must have no jumps (interpolate between the entries of a "
+            "table), grow slower than 1/cos²θ at grazing and be wider than 1e-6 rad"
         )
     return np.stack([1 / fine, widths])
 

@@ -23,7 +23,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from whitefurnace.errors import DeviceError, UnsupportedError, UsageError
+from whitefurnace.catalogue.user_text import MARK
+from whitefurnace.errors import DeviceError, InputError, UnsupportedError, UsageError
+from whitefurnace.opencl.complaints import about_user_file
 
 # pyopencl takes 0.1 to 0.3 s to import, so it is imported by `_opencl()` at the first use of a device.
 
@@ -592,7 +594,7 @@ class Device:
         """Build OpenCL C 1.2 `text` and return the program; the same text and options return the same object.
 
         options: values by name, each passed as -D. Floats are written as Python writes them, without a suffix. Raises
-        DeviceError with the compiler's first errors.
+        DeviceError with the compiler's first errors, InputError where they are about a user's model file.
         """
         cl = _opencl()  # refused in a forked process before the lock, which a thread of the parent may have held
         # No fast-math: explicit lanes gain nothing by it and compensated sums break under it.
@@ -607,6 +609,8 @@ class Device:
                     except (cl.Error, OSError) as error:
                         failure = error
                 if failure is not None:
+                    if MARK in text and (complaint := about_user_file([*str(failure).splitlines(), *noise])):
+                        raise InputError(complaint) from failure
                     why = _first_errors(str(failure), noise) or _first_line(failure)
                     raise DeviceError(f"a kernel did not build on {self.name}: {why}") from failure
                 self._programs[key] = Program(self, raw)

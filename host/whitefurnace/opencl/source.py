@@ -15,8 +15,9 @@ from importlib import resources
 from typing import Any
 
 from whitefurnace.catalogue import Integral, Model
+from whitefurnace.catalogue.user_text import MARK
 from whitefurnace.opencl import constants
-from whitefurnace.opencl.bindings import FUNCTIONS, VECTOR, bindings, is_isotropic
+from whitefurnace.opencl.bindings import FUNCTIONS, VECTOR, bindings, is_isotropic, lanes
 
 LOBE_WIDTH = 0.05
 """Where the rule of a user's BRDF grades its half vectors, in radians. Lobes ten times narrower are still met."""
@@ -226,7 +227,7 @@ def assembled(
     lines: list[str] = []
 
     def add(name: str, text: str) -> None:
-        quoted = name.replace("\\", "/").replace('"', "'")
+        quoted = " ".join(name.replace("\\", "/").replace('"', "'").split())
         lines.append(f'#line 1 "{quoted}"\n{text.rstrip()}\n')
 
     for piece in row.pieces:
@@ -244,7 +245,9 @@ def assembled(
                 if entry.text is None:
                     add(entry.kernel_file, _file(entry.kernel_file))
                 else:
-                    add(entry.path or entry.name, entry.text)
+                    add("user.clh", _file("user.clh"))
+                    add(MARK + (entry.path or entry.name), entry.text)
+                    add("lanes", lanes(entry))
         else:
             add(name, _CONSTANTS[name]() if name in _CONSTANTS else texts[name])
     whole = "".join(lines)

@@ -1,0 +1,361 @@
+"""Translates a user's `.clh` text, in OpenCL C or with the habits of GLSL and HLSL, to the text that a program holds.
+
+The user's functions compute one lane with plain numbers, so that branches, loops, tables and indices work
+(`opencl.bindings` calls them lane by lane). Names are kept apart from those of our kernels: a name that the file
+declares begins with `own_`, any other with `user_`, where `kernels/user.clh` defines the vocabulary for such files.
+Lines stay where they were, so that a compiler's message names the line of the file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from whitefurnace.errors import InputError
+
+OWN, OFFERED = "own_", "user_"
+"""How names begin that the file declares, and all others."""
+
+MARK = "user's file "
+"""How the name of a user's file begins in `#line`, by which a compiler's message about it is known."""
+
+NUMBERS = ("real", "float", "double", "half", "scalar")
+"""Types that stand for one number of the working precision."""
+
+VECTORS = {
+    f"{name}{count}": f"scalar{count}" for name in ("real", "float", "double", "half", "vec") for count in (2, 3, 4)
+}
+"""Types that stand for a vector of such numbers, with the type of the translation."""
+
+_TYPES = {
+    **dict.fromkeys(NUMBERS, "scalar"),
+    **VECTORS,
+    **{f"ivec{count}": f"int{count}" for count in (2, 3, 4)},
+    **{f"uvec{count}": f"uint{count}" for count in (2, 3, 4)},
+    **{name: name for name in ("int", "uint", "bool", "void", "char", "uchar", "short", "ushort", "long", "ulong")},
+    **{f"{name}{count}": f"{name}{count}" for name in ("int", "uint") for count in (2, 3, 4)},
+    **{name: name for name in ("unsigned", "signed", "size_t")},
+}
+
+_KEYWORDS = frozenset(
+    "if else for while do switch case default break continue return goto const constant __constant static struct union "
+    "enum typedef sizeof volatile restrict private __private __attribute__ defined true false".split()
+)
+_DROPPED = frozenset(("inline", "precision", "highp", "mediump", "lowp"))
+_REFUSED = {
+    **dict.fromkeys(("out", "inout"), "parameters that a function writes to are not read; return the value"),
+    **dict.fromkeys(("mat2", "mat3", "mat4"), "matrices are not known here; write the sums out"),
+    **dict.fromkeys(("kernel", "__kernel"), "write functions only; the engine calls them"),
+    **dict.fromkeys(("global", "__global", "local", "__local"), "a model reads no buffers, only its parameters"),
+    **dict.fromkeys(("uniform", "varying", "attribute", "layout"), "make it a parameter of the function"),
+    **dict.fromkeys(("sampler2D", "samplerCube", "image2d_t"), "a model reads no images"),
+    "discard": "return 0 instead",
+    "asm": "assembly is not taken",
+    "__asm__": "assembly is not taken",
+}
+_STORAGE = frozenset(("static", "const", "constant", "__constant"))
+_IGNORED_DIRECTIVES = frozenset(("pragma", "version", "extension"))
+_RAW_DIRECTIVES = frozenset(("error", "line"))
+_DIRECTIVES = _IGNORED_DIRECTIVES | _RAW_DIRECTIVES | frozenset("define undef if ifdef ifndef elif else endif".split())
+
+# Names of components stay as they are everywhere; no kernel defines a macro of such a name.
+_COMPONENTS = re.compile(r"[xyzw]{1,4}|[rgba]{1,4}|s[0-9a-fA-F]|lo|hi|even|odd")
+
+_TOKEN = re.compile(
+    r"""(?P<comment>//(?:\\\n|[^\n])*|/\*.*?\*/)
+    |(?P<open>/\*)
+    |(?P<splice>\\[ \t]*\n)
+    |(?P<newline>\n)
+    |(?P<space>[ \t\f\v]+)
+    |(?P<string>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')
+    |(?P<hex>0[xX][0-9a-fA-F]+[uUlL]*(?![\w.]))
+    |(?P<float>(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?(?:lf|LF|[fFhHdDlL])?(?!\w)|\d+[eE][+-]?\d+(?:lf|LF|[fFhHdDlL])?(?!\w)
+        |\d+(?:lf|LF|[fFhH])(?!\w))
+    |(?P<int>\d+[uUlL]*(?![\w.]))
+    |(?P<number>\.?\d(?:[eEpP][+-]|[\w.])*)
+    |(?P<name>[A-Za-z_]\w*)
+    |(?P<sign>[{}()\[\];,.?:~!%^&*\-+=|<>/#])
+    |(?P<other>.)""",
+    re.VERBOSE | re.DOTALL | re.ASCII,
+)
+
+
+@dataclass
+class Token:
+    """A token of the file.
+
+    kind: a group of `_TOKEN`. line: its line. depth: the braces around it. directive: whether it is part of a
+    preprocessor line.
+    """
+
+    kind: str
+    text: str
+    line: int
+    depth: int = 0
+    directive: bool = False
+
+
+_END = Token("end", "", 0)
+
+
+def decoded(raw: bytes, where: str) -> str:
+    """Return the text of a file with plain line ends and without a byte-order mark; InputError where it is no text."""
+    coding = "utf-16" if raw.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
+    try:
+        text = raw.decode(coding)
+    except UnicodeDecodeError:
+        raise InputError(f"{where}: is not a text file") from None
+    if "\0" in text:
+        raise InputError(f"{where}: is not a text file")
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def tokens(text: str, where: str) -> list[Token]:
+    """Split the text of the file `where`; a comment becomes a space, and its line ends remain.
+
+    Raises InputError with the line of what no model can hold: a comment or bracket that is not closed, a string, or a
+    character outside ASCII.
+    """
+    found: list[Token] = []
+    brackets: list[Token] = []
+    line, depth, directive, fresh = 1, 0, False, True  # fresh: the line has held spaces only
+    for match in _TOKEN.finditer(text):
+        kind, part = str(match.lastgroup), match[0]
+        directive = directive or (fresh and part == "#")
+        token = Token(kind, part, line, depth, directive)
+        line += part.count("\n")
+        if kind == "open":
+            raise InputError(f"{where}:{token.line}: a comment begins here with /* and is not closed")
+        if kind in ("number", "other"):
+            hint = "" if part.isascii() else ", which is not ASCII: write it out in letters"
+            raise InputError(f"{where}:{token.line}: {part!r} cannot be read{hint}")
+        if kind == "comment":
+            token.text = " " + "\n" * part.count("\n")
+        elif kind == "newline":
+            fresh, directive = True, False
+        elif kind != "space":
+            fresh = False
+        if kind == "sign" and not directive:
+            _match_brackets(token, brackets, where)
+            depth += {"{": 1, "}": -1}.get(part, 0)
+        found.append(token)
+    if brackets:
+        raise InputError(f"{where}:{brackets[-1].line}: the {brackets[-1].text!r} of this line is not closed")
+    return found
+
+
+def _match_brackets(token: Token, brackets: list[Token], where: str) -> None:
+    """Keep the list of open brackets; InputError where one closes that was not opened."""
+    if token.text in ("(", "[", "{"):
+        brackets.append(token)
+    elif token.text in (")", "]", "}"):
+        if not brackets:
+            raise InputError(f"{where}:{token.line}: {token.text!r} closes nothing")
+        opened = brackets.pop()
+        if "([{".index(opened.text) != ")]}".index(token.text):
+            raise InputError(
+                f"{where}:{token.line}: {token.text!r} does not close the {opened.text!r} of line {opened.line}"
+            )
+
+
+@dataclass(frozen=True)
+class Signature:
+    """A function that the file defines: its name, the type that it returns, and its parameters as (type, name)."""
+
+    name: str
+    result: str
+    parameters: tuple[tuple[str, str], ...]
+    line: int
+
+
+class UserText:
+    """The tokens of a user's file, what it declares, and its translation.
+
+    text: the file's text, with includes resolved. where: its path, for messages. Raises InputError as `tokens` does.
+    """
+
+    def __init__(self, text: str, where: str) -> None:
+        self.where = where
+        self._all = tokens(text, where)
+        self._solid = [token for token in self._all if token.kind not in ("space", "comment", "newline", "splice")]
+        self._types = set(_TYPES)
+        self._functions: set[str] = set()
+        self._variables: set[str] = set()
+        for n in range(len(self._solid)):
+            self._declare(n)
+
+    def _at(self, n: int) -> Token:
+        """The n-th token that is no space, or one of the kind "end" outside the text."""
+        return self._solid[n] if 0 <= n < len(self._solid) else _END
+
+    # ------------------------------------------------------------------------------------------ what it declares
+
+    def _declare(self, n: int) -> None:
+        """Note the name that the n-th token declares, if it does: a function, macro, variable or type."""
+        token, before, after = self._at(n), self._at(n - 1), self._at(n + 1)
+        if token.kind != "name" or token.text in _KEYWORDS or token.text in _TYPES:
+            return
+        if before.text == "define":
+            self._functions.add(token.text)
+            self._variables.add(token.text)
+        elif before.text in ("struct", "union", "enum") or (
+            after.text == ";" and any(t.text == "typedef" for t in self._statement(n))
+        ):
+            self._types.add(token.text)
+            self._variables.add(token.text)
+        elif before.text in self._types or (before.text == "*" and self._at(n - 2).text in self._types):
+            (self._functions if after.text == "(" else self._variables).add(token.text)
+        elif before.text == "," and not token.directive and self._in_declaration(n):
+            self._variables.add(token.text)
+
+    def _statement(self, n: int) -> Iterator[Token]:
+        """The tokens before the n-th back to the end of the statement before, at the depth of the n-th or deeper."""
+        depth = self._at(n).depth
+        while (n := n - 1) >= 0:
+            token = self._at(n)
+            if token.depth < depth or (token.depth == depth and token.text in (";", "{") and depth) or token.directive:
+                return
+            if token.depth == depth and token.text == ";":
+                return
+            yield token
+
+    def _in_declaration(self, n: int) -> bool:
+        """Whether the n-th token, after a comma, is a further name in a declaration such as `float a = f(x, y), b;`."""
+        level = 0
+        before = list(self._statement(n))
+        for token in before:
+            level += {")": 1, "]": 1, "}": 1, "(": -1, "[": -1, "{": -1}.get(token.text, 0)
+            if level < 0:
+                return False  # the comma separates arguments or elements
+        words = [token.text for token in reversed(before)]
+        while words and words[0] in ("const", "constant", "__constant", "static", "for", "("):
+            words.pop(0)
+        return len(words) > 1 and words[0] in self._types and words[1] not in ("(", ")")
+
+    def signatures(self) -> dict[str, Signature]:
+        """The functions that the file defines, by name."""
+        found = {}
+        for n, token in enumerate(self._solid):
+            if token.kind != "name" or token.depth or token.directive or self._at(n + 1).text != "(":
+                continue
+            close = n + 2
+            while self._at(close).kind != "end" and self._at(close).text != ")":
+                close += 1
+            if self._at(close + 1).text == "{":
+                inside = self._solid[n + 2 : close]
+                found[token.text] = Signature(
+                    token.text, self._at(n - 1).text, tuple(self._parameters(inside)), token.line
+                )
+        return found
+
+    @staticmethod
+    def _parameters(inside: Sequence[Token]) -> Iterator[tuple[str, str]]:
+        """Type and name of each parameter in the tokens between the brackets of a signature."""
+        words: list[str] = []
+        for token in (*inside, Token("sign", ",", 0)):
+            if token.text != ",":
+                if token.text not in ("const", "in", *_DROPPED):
+                    words.append(token.text)
+                continue
+            if words and words != ["void"]:
+                yield " ".join(words[:-1]), words[-1]
+            words = []
+
+    # ------------------------------------------------------------------------------------------ translation
+
+    def translation(self) -> str:
+        """Return the text that a program holds. Raises InputError with the line of what cannot be translated."""
+        return "".join(self._pieces())
+
+    def _pieces(self) -> Iterator[str]:
+        n, k = 0, 0
+        constants = self._constants()
+        while k < len(self._all):
+            token = self._all[k]
+            if token.kind in ("space", "comment", "newline", "splice"):
+                yield token.text
+            elif token.directive and token.text == "#":
+                n, k, piece = self._directive(n, k)
+                yield piece
+                continue
+            else:
+                if constants.get(n):
+                    yield "constant "
+                if n not in constants or token.text not in _STORAGE:
+                    yield self._translated(n)
+                n += 1
+            k += 1
+
+    def _directive(self, n: int, k: int) -> tuple[int, int, str]:
+        """Translate a preprocessor line from its `#`, the n-th solid token and the k-th of all.
+
+        Returns the places after it, and its text.
+        """
+        line = self._at(n).line
+        name = self._at(n + 1).text if self._at(n + 1).directive and self._at(n + 1).line == line else ""
+        if name and name not in _DIRECTIVES:
+            raise InputError(f"{self.where}:{line}: #{name} is not taken in a model's file")
+        left_out, text = not name or name in _IGNORED_DIRECTIVES, ""
+        while k < len(self._all) and (self._all[k].directive or self._all[k].kind == "space"):
+            token = self._all[k]
+            if token.kind in ("space", "comment", "splice", "newline"):
+                text += "\n" * token.text.count("\n") if left_out else token.text
+            else:
+                if not left_out:
+                    text += token.text if token.text in ("#", name) or name in _RAW_DIRECTIVES else self._translated(n)
+                n += 1
+            k += 1
+            if token.kind == "newline":
+                break
+        return n, k, text
+
+    def _constants(self) -> dict[int, bool]:
+        """Places of words in declarations of variables outside functions; True where one begins.
+
+        OpenCL C asks for the address space `constant` there, which `static` and `const` do not say.
+        """
+        places: dict[int, bool] = {}
+        for n, token in enumerate(self._solid):
+            before = self._at(n - 1)
+            begins = before.kind == "end" or before.directive or (not before.depth and before.text == ";")
+            begins = begins or (before.text == "}" and not token.depth)
+            if token.kind != "name" or token.depth or token.directive or not begins:
+                continue
+            end = n
+            while self._at(end).kind == "name" or self._at(end).text == "*":
+                end += 1
+            declares = end - n > 1 and self._at(end).text in ("=", "[", ";", ",")
+            if declares and token.text not in ("typedef", "struct", "union", "enum", "precision"):
+                places |= {k: k == n for k in range(n, end)}
+        return places
+
+    def _translated(self, n: int) -> str:
+        """The translation of the n-th solid token."""
+        token = self._at(n)
+        if token.kind == "float":
+            digits = re.sub("(?:lf|LF|[fFhHdDlL])$", "", token.text)
+            return f"USER_NUMBER({digits if re.search('[.eE]', digits) else digits + '.0'})"
+        if token.kind == "string":
+            raise InputError(f"{self.where}:{token.line}: {token.text} is a string, which a model cannot hold")
+        return self._name(n) if token.kind == "name" else token.text
+
+    def _name(self, n: int) -> str:
+        token, before, after = self._at(n), self._at(n - 1), self._at(n + 1)
+        name, called = token.text, after.text == "("
+        if before.text == ".":
+            known = _COMPONENTS.fullmatch(name)
+            letters = str.maketrans("rgba", "xyzw") if known and set(name) <= set("rgba") else {}
+            return name.translate(letters) if known else OWN + name
+        if name in _TYPES:
+            builds = called and name != "void" and self._at(n + 2).text != ")"
+            return OFFERED + name if builds else _TYPES[name]
+        if name in self._functions if called else name in self._variables:
+            return name if _COMPONENTS.fullmatch(name) else OWN + name
+        if name in _DROPPED or (name == "in" and after.kind == "name"):
+            return ""
+        if name in _REFUSED:
+            raise InputError(f"{self.where}:{token.line}: {name!r} is not taken: {_REFUSED[name]}")
+        if name in _KEYWORDS or name.startswith("__") or (_COMPONENTS.fullmatch(name) and not called):
+            return name
+        return OFFERED + name
