@@ -756,6 +756,30 @@ def test_copies_of_reduced_size_do_not_count(tmp_path):
     assert read_image(path).pixels.shape == (4, 8, 3)
 
 
+def test_a_curve_of_floats(tmp_path):
+    """A profile says that floats are encoded too: sRGB's curve goes on over 1; a table ends there."""
+    floats = np.tile(np.array([0.25, 0.5, 2.0], np.float32), (4, 8, 1))
+    path = tiff(tmp_path / "a.tif", [page(floats, 2, form=3, t34675=(7, list(matrix_profile([SRGB_PARA]))))])
+    want = ((np.array([0.25, 0.5, 2.0]) + 0.055) / 1.055) ** 2.4
+    np.testing.assert_allclose(read_image(path).pixels[0, 0], want, rtol=1e-6)
+    path = tiff(tmp_path / "b.tif", [page(floats, 2, form=3, t34675=(7, list(matrix_profile([curv()]))))])
+    np.testing.assert_array_equal(read_image(path).pixels, floats)
+    table = matrix_profile([curv(0, 10000, 65535)])
+    path = tiff(tmp_path / "c.tif", [page(floats, 2, form=3, t34675=(7, list(table)))])
+    refused(path, "floats out of [0, 1]")
+
+
+def test_big_tiff(tmp_path):
+    spec = oiio.ImageSpec(8, 4, 3, "uint8")
+    spec.attribute("tiff:bigtiff", 1)
+    icc = np.frombuffer(matrix_profile([curv()]), np.uint8)
+    spec.attribute("ICCProfile", oiio.TypeDesc(f"uint8[{len(icc)}]"), icc)
+    out = oiio.ImageOutput.create("tiff")
+    assert out.open(str(tmp_path / "a.tif"), spec) and out.write_image(RGB8) and out.close()
+    assert (tmp_path / "a.tif").read_bytes()[:3] == b"II+"
+    np.testing.assert_allclose(read_image(tmp_path / "a.tif").pixels[0, 0], np.array([64, 128, 192]) / 255, rtol=1e-6)
+
+
 # --- other formats ---------------------------------------------------------------------------------------
 
 
@@ -770,11 +794,42 @@ def test_inks_and_other_statements_are_refused(tmp_path):
     out = oiio.ImageOutput.create("dpx")
     assert out.open(str(tmp_path / "c.dpx"), spec) and out.write_image(RGBF) and out.close()
     refused(tmp_path / "c.dpx", "KodakLog")
+
+
+@pytest.mark.parametrize("stated", [{0xA001: 2}, {0xA001: 65535, 0xA005: {1: "R03", 2: b"0100"}}])
+def test_adobe_rgb_by_exif(tmp_path, stated):
+    """The primaries of Adobe RGB (1998) and its exponent 563/256; its own matrix of XYZ has five digits."""
+    to_xyz = np.array([[0.57667, 0.18556, 0.18823], [0.29734, 0.62736, 0.07529], [0.02703, 0.07069, 0.99134]])
     exif = Pillow.Exif()
-    exif.get_ifd(0x8769)[0xA001] = 2
-    picture.save(tmp_path / "d.jpg", exif=exif.tobytes(), quality=100, subsampling=0)
-    pixels = read_image(tmp_path / "d.jpg")
-    assert "Adobe RGB" in pixels.notices[0]
+    exif[0x8769] = stated
+    codes = np.tile(np.array([120, 128, 130], np.uint8), (8, 16, 1))
+    path = tmp_path / "a.jpg"
+    Pillow.fromarray(codes).save(path, exif=exif.tobytes(), quality=100, subsampling=0)
+    image = read_image(path)
+    assert "Adobe RGB" in image.notices[0]
+    want = np.linalg.solve(SRGB_TO_XYZ, to_xyz @ (codes[0, 0] / 255) ** (563 / 256))
+    np.testing.assert_allclose(image.pixels[0, 0], want, rtol=0.02)  # JPEG's colours err by a code
+    # A profile says more than Exif, and a chunk sRGB of a PNG too.
+    Pillow.fromarray(codes).save(path, exif=exif.tobytes(), icc_profile=matrix_profile([SRGB_PARA]))
+    assert read_image(path).notices == ()
+
+
+def test_panoramas_say_what_they_are(tmp_path):
+    def saved(**fields):
+        text = " ".join(f'GPano:{name}="{value}"' for name, value in fields.items())
+        xmp = (
+            '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+            f'<rdf:Description rdf:about="" xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" {text}/>'
+            "</rdf:RDF></x:xmpmeta>"
+        )
+        Pillow.fromarray(RGB8).save(tmp_path / "a.jpg", xmp=xmp.encode())
+        return tmp_path / "a.jpg"
+
+    whole = {"FullPanoWidthPixels": 8, "CroppedAreaImageWidthPixels": 8, "ProjectionType": "equirectangular"}
+    assert read_image(saved(**whole, PoseHeadingDegrees=90)).notices == ()
+    assert "tilted" in read_image(saved(**whole, PosePitchDegrees=10)).notices[0]
+    refused(saved(ProjectionType="cylindrical"), "cylindrical")
+    refused(saved(FullPanoHeightPixels=16, CroppedAreaImageHeightPixels=4), "height 4 of 16")
 
 
 def test_jpeg_xl_by_code_points(tmp_path):

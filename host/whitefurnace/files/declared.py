@@ -24,7 +24,7 @@ from whitefurnace.files.colour import (
     power,
 )
 from whitefurnace.files.icc import MAX_BYTES, read_icc
-from whitefurnace.files.tiff import read_tiff
+from whitefurnace.files.tiff import directories, directory, read_tiff
 
 # Adobe RGB (1998) Color Image Encoding, 4.3.1: the exponent 563/256 and the primaries.
 _ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
@@ -53,6 +53,7 @@ def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Decla
     Raises `InputError` for what is neither read nor harmless. Adds sentences to `notices` for what is left out.
     """
     _check_aspect(spec, path)
+    _check_panorama(spec, path, notices)
     channels = 3 if spec.nchannels >= 3 else 1
     associated = inverted = False
     encoding: Encoding | None
@@ -78,7 +79,7 @@ def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Decla
             _check_jpeg2000(path)
         encoding = _by_attributes(spec, form, path, channels)
     if encoding is None:
-        encoding = _exif(spec, path)
+        encoding = _exif(spec)
     return Declared(encoding, associated, inverted)
 
 
@@ -129,13 +130,34 @@ def _by_attributes(spec: Any, form: str, path: Path, channels: int) -> Encoding 
     return Encoding((curve,), f"its header (the colour space {space[:40]})")
 
 
-def _exif(spec: Any, path: Path) -> Encoding | None:
-    """Return Adobe RGB where Exif states it: ColorSpace 2, or the interoperability index R03 [DCF 2.0, 5.2]."""
-    space = spec.getattribute("Exif:ColorSpace")
-    index = str(spec.getattribute("Exif:InteroperabilityIndex") or "")
-    if space == 2 or index.startswith("R03"):
-        return Encoding((_ADOBE_CURVE,), "its Exif (Adobe RGB)", from_primaries(_ADOBE_RGB))
-    return None
+def _check_panorama(spec: Any, path: Path, notices: list[str]) -> None:
+    """Refuse another projection than the lat-long, or a part of one, by the metadata GPano of panorama programs."""
+    projection = str(spec.get_string_attribute("GPano:ProjectionType") or "equirectangular")
+    if projection.lower() != "equirectangular":
+        shown = "".join(c if c.isprintable() else "?" for c in projection[:40])
+        raise InputError(f"{path} states the projection {shown!r} (GPano), a lat-long (equirectangular) was expected")
+    for axis in ("Width", "Height"):
+        part = spec.get_int_attribute(f"GPano:CroppedAreaImage{axis}Pixels", 0)
+        whole = spec.get_int_attribute(f"GPano:FullPano{axis}Pixels", 0)
+        if 0 < part < whole:
+            raise InputError(
+                f"{path} states that it is a part of its panorama, {axis.lower()} {part} of {whole} pixels (GPano); "
+                "the whole was expected"
+            )
+    pitch, roll = (float(spec.get_float_attribute(f"GPano:Pose{name}Degrees", 0.0)) for name in ("Pitch", "Roll"))
+    if abs(pitch) > 0.1 or abs(roll) > 0.1:
+        notices.append(
+            f"{path}: says that the camera was tilted (GPano: pitch {pitch:g}°, roll {roll:g}°); it is read as it is"
+        )
+
+
+def _exif(spec: Any) -> Encoding | None:
+    """Return Adobe RGB where Exif's ColorSpace is 2, as programs write it."""
+    return _adobe_rgb() if spec.getattribute("Exif:ColorSpace") == 2 else None
+
+
+def _adobe_rgb() -> Encoding:
+    return Encoding((_ADOBE_CURVE,), "its Exif (Adobe RGB)", from_primaries(_ADOBE_RGB))
 
 
 # --- PNG ------------------------------------------------------------------------------------------------
@@ -167,7 +189,9 @@ def _png(path: Path, channels: int) -> Encoding | None:
         return from_code_points(found[b"cICP"], "its cICP chunk", path)
     if b"iCCP" in found:
         return read_icc(_inflated(found[b"iCCP"], path), path, "its iCCP chunk", channels)
-    if b"sRGB" in found or not (b"gAMA" in found or b"cHRM" in found):
+    if b"sRGB" in found:
+        return Encoding((SRGB_CURVE,), "")
+    if not (b"gAMA" in found or b"cHRM" in found):
         return None
     curve: Curve = SRGB_CURVE
     said = []
@@ -235,13 +259,14 @@ def _jpeg(path: Path, spec: Any, channels: int, notices: list[str]) -> Encoding 
         raise InputError(f"{path} is a JPEG of inks ({space}), grey and RGB are read; convert it to sRGB")
     pieces: dict[int, bytes] = {}
     counts = set()
-    gain_map = False
+    gain_map = adobe_rgb = False
     with open(path, "rb") as file:
         for marker, length in _jpeg_segments(file):
             if marker not in (0xE1, 0xE2):
                 continue
             body = file.read(length)
             gain_map |= b"hdrgm:Version" in body or body.startswith(b"urn:iso:std:iso:ts:21496")
+            adobe_rgb |= marker == 0xE1 and _is_adobe_rgb(body)
             if marker == 0xE2 and body.startswith(_ICC) and len(body) > 14:
                 if body[12] in pieces:
                     raise InputError(f"{path} is corrupted: part {body[12]} of its ICC profile is there twice")
@@ -250,10 +275,24 @@ def _jpeg(path: Path, spec: Any, channels: int, notices: list[str]) -> Encoding 
     if gain_map:
         notices.append(f"{path}: has a gain map for displays of high range, which was left out; its picture was read")
     if not pieces:
-        return None
+        return _adobe_rgb() if adobe_rgb else None
     if len(counts) != 1 or sorted(pieces) != list(range(1, counts.pop() + 1)):
         raise InputError(f"{path} is corrupted: its ICC profile is not complete, parts {sorted(pieces)} are there")
     return read_icc(b"".join(pieces[k] for k in sorted(pieces)), path, "its APP2 segment", channels)
+
+
+def _is_adobe_rgb(body: bytes) -> bool:
+    """Return whether a segment APP1 is Exif with the interoperability index R03, which is Adobe RGB [DCF 2.0, 5.2]."""
+    if not body.startswith(b"Exif\0\0"):
+        return False
+    data = body[6:]
+    try:
+        first = next(directories(data, (34665,)))
+        second, _ = directory(data, int(first[34665][0]), (40965,))
+        third, _ = directory(data, int(second[40965][0]), (1,))
+        return bytes(third[1]).startswith(b"R03")  # type: ignore[arg-type]
+    except (struct.error, LookupError, TypeError, ValueError, OverflowError, StopIteration):
+        return False
 
 
 def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:

@@ -33,6 +33,7 @@ class Radiance:
     notices        what the header states, for people
     start          offset of the pixels; `lines` and `length` their number of scanlines and texels in each
     order          the resolution string, such as "-Y 64 +X 128"
+    plain          whether rows run from the top and from the left, and lines end as on Unix
     """
 
     width: int
@@ -43,11 +44,7 @@ class Radiance:
     lines: int
     length: int
     order: str
-
-    @property
-    def plain(self) -> bool:
-        """Whether rows run from top to bottom and left to right."""
-        return self.order.startswith("-Y") and " +X" in self.order
+    plain: bool
 
     def rewrite(self, path: Path, copy: Path, flat: bytes | None) -> None:
         """Write the pixels of `path`, or these flat ones, with a header in which scanlines are rows from the top."""
@@ -115,8 +112,9 @@ def read_radiance_header(path: Path) -> Radiance:
     encoding, notices = _encoding(lines, path)
     first, second = int(found[3]), int(found[6])
     width, height = (first, second) if found[2] == b"X" else (second, first)
-    order = b"%b%b %d %b%b %d" % (found[1], found[2], first, found[4], found[5], second)
-    return Radiance(width, height, encoding, notices, stop + 1, first, second, order.decode("ascii"))
+    order = f"{found[1].decode()}{found[2].decode()} {first} {found[4].decode()}{found[5].decode()} {second}"
+    plain = order == f"-Y {first} +X {second}" and b"\r" not in head[: stop + 1]
+    return Radiance(width, height, encoding, notices, stop + 1, first, second, order, plain)
 
 
 def _check_format(lines: list[bytes], path: Path) -> None:

@@ -34,8 +34,9 @@ _CHUNK_BYTES = 8 << 20
 _MAX_RATIO = 2000
 # Formats of OpenImageIO that are no images: `null` makes one from a file's name, `zfile` holds depth.
 _NOT_IMAGES = ("null", "zfile", "term")
-# Formats of printing density (Cineon), of unknown curves and primaries, or of measurements of any unit (FITS).
-_UNREAD = ("cineon", "fits", "rla", "softimage")
+# Formats of printing density (Cineon), of unknown curves and primaries, of measurements of any unit (FITS), or that
+# hold files of another format (ICO).
+_UNREAD = ("cineon", "fits", "ico", "rla", "softimage")
 _SRGB = Encoding((SRGB_CURVE,), "sRGB")
 
 
@@ -169,7 +170,7 @@ def opened(path: Path, size: int, *, unassociated: bool = False) -> Iterator[Ope
         shown = path
         if radiance is not None:
             flat = radiance.unpacked(path)
-            if flat is not None or not radiance.plain or b"\r" in head[: radiance.start]:
+            if flat is not None or not radiance.plain:
                 path = stack.enter_context(_scratch_file(".hdr"))
                 radiance.rewrite(shown, path, flat)
         try:
@@ -221,11 +222,8 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
     else:
         declared = read_declared(path, form, spec, notices)
     # TIFF, PNG and WebP are looked at in `declared`; others have one image, or the whole one first.
-    if form in ("gif", "ico", "jpegxl") and source.seek_subimage(1, 0):
-        if form != "ico":
-            raise InputError(f"{path} holds several images or frames, a single one was expected")
-        source.seek_subimage(0, 0)
-        notices.append(f"{path}: only the first of its images was read")
+    if form in ("gif", "jpegxl") and source.seek_subimage(1, 0):
+        raise InputError(f"{path} holds several images or frames, a single one was expected")
     _complaint(source)
     if int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
         notices.append(f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read")

@@ -29,7 +29,9 @@ def check_file(path: Path, size: int, head: bytes) -> None:
 
 
 def _check_png(path: Path, size: int) -> None:
-    """Verify every length and checksum. libpng would print errors in the pixels on stderr."""
+    """Verify every length and checksum, and the rows. libpng would print errors in them on stderr."""
+    rows: _Rows | None = None
+    palette = False
     with open(path, "rb") as file:
         start = 8
         while True:
@@ -43,15 +45,92 @@ def _check_png(path: Path, size: int) -> None:
                     f"{path} is truncated or corrupted: the PNG chunk at byte {start} reaches beyond the end "
                     f"of the file at byte {size}"
                 )
-            first = file.read(min(length, 1 << 20))
-            checksum, left = zlib.crc32(first, zlib.crc32(kind)), length - len(first)
+            if (rows is None) != (kind == b"IHDR"):
+                raise InputError(f"{path} is corrupted: its PNG data does not begin with one header, IHDR")
+            checksum, left, blocks = zlib.crc32(kind), length, []
             while left and (block := file.read(min(left, 1 << 20))):
                 checksum, left = zlib.crc32(block, checksum), left - len(block)
+                if kind == b"IDAT" and rows is not None:
+                    rows.take(block)
+                elif kind == b"IHDR":
+                    blocks.append(block)
             if checksum != int.from_bytes(file.read(4), "big"):
                 raise InputError(f"{path} is corrupted: the PNG chunk at byte {start} does not match its checksum")
+            palette |= kind == b"PLTE"
+            if kind == b"IDAT" and rows is not None and rows.indexed and not palette:
+                raise InputError(f"{path} is corrupted: its pixels are of a palette (PLTE), which is not before them")
+            if kind == b"IHDR":
+                rows = _Rows(b"".join(blocks), path)
             if kind == b"IEND":
-                return
+                break
             start += 12 + length
+    if rows is None or not rows.whole:
+        raise InputError(f"{path} is truncated or corrupted: its rows end early")
+
+
+# Of Adam7: first column and row, and the steps of both, for each of the seven passes [PNG 3, 8.1].
+_PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+_SURPLUS = 1 << 16  # bytes after the rows, from which on the end of the data is not looked for
+_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+_DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
+
+
+class _Rows:
+    """The deflated rows of a PNG: inflates them as they come, and looks at the filter of each."""
+
+    def __init__(self, header: bytes, path: Path) -> None:
+        self._path = path
+        if len(header) != 13:
+            raise self._wrong(f"its header has {len(header)} bytes, 13 were expected")
+        width, height, depth, colour, method, filters, interlace = struct.unpack(">2I5B", header)
+        sizes = 0 < width < 1 << 31 and 0 < height < 1 << 31
+        if not sizes or depth not in _DEPTHS.get(colour, ()) or method or filters or interlace > 1:
+            raise self._wrong(
+                f"its header states {width} x {height} pixels of {depth} bits, colour type {colour}, compression "
+                f"{method}, filter {filters} and interlace {interlace}, which PNG does not know"
+            )
+        passes = _PASSES if interlace else ((0, 0, 1, 1),)
+        # Number of rows and bytes in each, of passes with pixels.
+        self._spans = [
+            (-(-(height - y) // dy), 1 + (-(-(width - x) // dx) * depth * _CHANNELS[colour] + 7) // 8)
+            for x, y, dx, dy in passes
+            if height > y and width > x
+        ]
+        self.indexed = colour == 3
+        self._inflate = zlib.decompressobj()
+        self._passed = 0  # bytes of the current span, and after the last one those that nobody needs
+
+    @property
+    def whole(self) -> bool:
+        """Whether all rows and the end of the deflated data have come."""
+        return not self._spans and (self._inflate.eof or self._passed > _SURPLUS)
+
+    def take(self, block: bytes) -> None:
+        try:
+            while block and not self._inflate.eof and self._passed <= _SURPLUS:
+                self._look(self._inflate.decompress(block, 1 << 20))
+                block = self._inflate.unconsumed_tail
+        except zlib.error as error:
+            raise self._wrong(f"its pixels cannot be inflated ({error})") from error
+
+    def _look(self, piece: bytes) -> None:
+        at = 0
+        while at < len(piece) and self._spans:
+            count, stride = self._spans[0]
+            end = min(len(piece), at + count * stride - self._passed)
+            marks = piece[at + -self._passed % stride : end : stride]
+            if marks and max(marks) > 4:
+                raise self._wrong("a row has a filter that PNG does not know")
+            self._passed += end - at
+            at = end
+            if self._passed == count * stride:
+                del self._spans[0]
+                self._passed = 0
+        if not self._spans:
+            self._passed += len(piece) - at
+
+    def _wrong(self, what: str) -> InputError:
+        return InputError(f"{self._path} is corrupted: {what}")
 
 
 def _check_tiff(path: Path) -> None:

@@ -57,40 +57,51 @@ def directories(data: mmap.mmap | bytes, wanted: Collection[int]) -> Iterator[di
 
     Raises `struct.error`, `LookupError` or `ValueError` where the file ends too early or its directories form a circle.
     """
-    order = "<" if data[:1] == b"I" else ">"
     big = 43 in (data[2], data[3])
-    offset, count, entry, inline = ("Q", "Q", 20, 8) if big else ("I", "H", 12, 4)
-    (at,) = struct.unpack_from(order + offset, data, 8 if big else 4)
+    (at,) = struct.unpack_from(_order(data) + ("Q" if big else "I"), data, 8 if big else 4)
     seen: set[int] = set()
     while at:
         if at in seen or len(seen) > _PAGE_LIMIT:
             raise ValueError("its directories form a circle")
         seen.add(at)
-        (entries,) = struct.unpack_from(order + count, data, at)
-        at += struct.calcsize(order + count)
-        tags: dict[int, Values] = {}
-        for k in range(min(entries, 65535)):
-            tag, kind, number = struct.unpack_from(order + "HH" + offset, data, at + k * entry)
-            value = at + k * entry + entry - inline
-            form = _TYPES.get(kind)
-            if tag not in wanted or form is None or number > len(data):
-                continue
-            size = struct.calcsize(order + form)
-            if number > _VALUE_LIMIT and form != "B":
-                raise ValueError(f"its tag {tag} has {number} values")
-            if number * size > inline:
-                (value,) = struct.unpack_from(order + offset, data, value)
-            if value + number * size > len(data):
-                raise ValueError(f"its tag {tag} reaches beyond the end of the file")
-            if form == "B":
-                tags[tag] = bytes(data[value : value + number])
-                continue
-            found = struct.unpack_from(f"{order}{number * len(form)}{form[0]}", data, value)
-            if form == "II":
-                found = tuple(a / b if b else float("nan") for a, b in zip(found[::2], found[1::2], strict=True))
-            tags[tag] = found
+        tags, at = directory(data, at, wanted)
         yield tags
-        (at,) = struct.unpack_from(order + offset, data, at + entries * entry)
+
+
+def directory(data: mmap.mmap | bytes, at: int, wanted: Collection[int]) -> tuple[dict[int, Values], int]:
+    """Return the tags in `wanted` of the directory at byte `at`, and where the next one is; 0 after the last."""
+    order = _order(data)
+    big = 43 in (data[2], data[3])
+    offset, count, entry, inline = ("Q", "Q", 20, 8) if big else ("I", "H", 12, 4)
+    (entries,) = struct.unpack_from(order + count, data, at)
+    at += struct.calcsize(order + count)
+    tags: dict[int, Values] = {}
+    for k in range(min(entries, 65535)):
+        tag, kind, number = struct.unpack_from(order + "HH" + offset, data, at + k * entry)
+        value = at + k * entry + entry - inline
+        form = _TYPES.get(kind)
+        if tag not in wanted or form is None or number > len(data):
+            continue
+        size = struct.calcsize(order + form)
+        if number > _VALUE_LIMIT and form != "B":
+            raise ValueError(f"its tag {tag} has {number} values")
+        if number * size > inline:
+            (value,) = struct.unpack_from(order + offset, data, value)
+        if value + number * size > len(data):
+            raise ValueError(f"its tag {tag} reaches beyond the end of the file")
+        if form == "B":
+            tags[tag] = bytes(data[value : value + number])
+            continue
+        found = struct.unpack_from(f"{order}{number * len(form)}{form[0]}", data, value)
+        if form == "II":
+            found = tuple(a / b if b else float("nan") for a, b in zip(found[::2], found[1::2], strict=True))
+        tags[tag] = found
+    (following,) = struct.unpack_from(order + offset, data, at + entries * entry)
+    return tags, int(following)
+
+
+def _order(data: mmap.mmap | bytes) -> str:
+    return "<" if data[:1] == b"I" else ">"
 
 
 _WANTED = {SUBFILE, BITS, PHOTOMETRIC, 277, 282, 283, 290, 291, 301, 318, 319, 338, 339, 532, 34675}
