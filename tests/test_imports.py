@@ -13,7 +13,7 @@ HOST = Path(__file__).resolve().parents[1] / "host" / "whitefurnace"
 
 # Packages and single modules from the ground up; each imports only what stands before it. "__init__" is the public API.
 ORDER = """
-    errors version expression text results catalogue files plot_style opencl sphere scenes integrals prefiltering
+    errors version expression text results files catalogue plot_style opencl sphere scenes integrals prefiltering
     verification engines tables baking inspection rendering batch benching advice __init__ cli __main__
 """.split()
 

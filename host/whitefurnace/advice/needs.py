@@ -15,11 +15,11 @@ import numpy as np
 
 from whitefurnace.baking.bake import DEMO
 from whitefurnace.baking.outputs import targets
-from whitefurnace.batch.jobs import SECONDS
+from whitefurnace.batch.jobs import MOST_BYTES, SECONDS
 from whitefurnace.catalogue.choice import chosen
 from whitefurnace.engines.presets import Engine, reduced
 from whitefurnace.errors import FileError, InputError, UsageError
-from whitefurnace.files import write_text
+from whitefurnace.files import read_input, write_text
 from whitefurnace.prefiltering.plan import plan_chain
 from whitefurnace.prefiltering.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain
 from whitefurnace.rendering.shading import SHADINGS, karis
@@ -613,10 +613,7 @@ def write_job(
     text = f"# What {_plain(scene)} needs of {_plain(found.engine.name)}, as `whitefurnace scene` says.\n" + "".join(
         f"\n[[{kind}]]\n" + "".join(f"{key} = {_toml(value)}\n" for key, value in one.items()) for kind, one in tables
     )
-    try:
-        there = path.read_bytes() if path.exists() else None
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+    there = read_input(path, "a job", most=MOST_BYTES) if path.exists() else None
     if there is not None and there != text.encode() and not force:
         raise FileError(f"{path} is there and is another job; move it away or give --force")
     write_text(path, text)

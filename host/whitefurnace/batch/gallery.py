@@ -21,7 +21,7 @@ from urllib.parse import quote
 from whitefurnace.baking.bake import format_notices
 from whitefurnace.batch.jobs import Result
 from whitefurnace.errors import FileError, WhitefurnaceError
-from whitefurnace.files import read_manifest, write_atomic
+from whitefurnace.files import head_of, open_input, read_manifest, write_atomic
 from whitefurnace.rendering.thumbnails import CELL, LOOK, read_thumbnail, write_thumbnail
 from whitefurnace.text import size as bytes_text
 
@@ -316,7 +316,7 @@ def _checked(folder: Path, force: bool) -> IO[bytes]:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not force and os.path.lexists(path):
-            with open(path, "rb") as file:
+            with open_input(path, "a report") as file:
                 if OURS not in file.read(4096):
                     raise FileError(f"{path} is there and is no report of whitefurnace; move it away or give --force")
         return tempfile.TemporaryFile(prefix="whitefurnace-")
@@ -376,8 +376,7 @@ def _attribute(name: str, value: str) -> str:
 
 def _dimensions(path: Path) -> tuple[int, int]:
     """Read the width and height of a PNG from its header [PNG 3, 11.2.1]."""
-    with open(path, "rb") as file:
-        head = file.read(24)
+    head = head_of(path, 24)
     if len(head) < 24 or head[12:16] != b"IHDR":
         raise FileError(f"{path} is not a PNG; remove it and run again")
     return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")

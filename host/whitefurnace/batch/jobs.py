@@ -28,7 +28,18 @@ from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import pool
 from whitefurnace.catalogue.choice import file_of
 from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, code_of, nearest
-from whitefurnace.files import FileOutput, FolderOutput, digest_file, is_lock, is_safe, locks_in, write_text
+from whitefurnace.files import (
+    FileOutput,
+    FolderOutput,
+    digest_file,
+    input_size,
+    is_lock,
+    is_safe,
+    locks_in,
+    read_input,
+    read_text,
+    write_text,
+)
 from whitefurnace.opencl.device import device_address
 from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
 from whitefurnace.sphere.environments import extent, source_files
@@ -277,13 +288,7 @@ def shard_of(text: str) -> tuple[int, int]:
 
 def _parsed(path: Path) -> dict[str, Any]:
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path} has {path.stat().st_size} bytes, a job has at most {MOST_BYTES}")
-        return tomllib.loads(path.read_bytes().decode())
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not UTF-8") from None
+        return tomllib.loads(read_text(path, "a job", most=MOST_BYTES))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not TOML: {error}") from None
 
@@ -807,13 +812,11 @@ def load(item: Item) -> Item:
         return item
     files = source_files(item.source)
     base = Path(item.source) if os.path.isdir(item.source) else Path(item.source).parent
-    try:
-        size = sum(os.stat(file).st_size for file in files)
-        if size > MOST_SENT:
-            raise InputError(f"{item.source} has {size} bytes, at most {MOST_SENT} are sent; use a shared folder")
-        return msgspec.structs.replace(item, content={os.path.relpath(file, base): file.read_bytes() for file in files})
-    except OSError as error:
-        raise FileError(f"cannot read {item.source}: {error.strerror or error}") from error
+    size = sum(input_size(file) for file in files)
+    if size > MOST_SENT:
+        raise InputError(f"{item.source} has {size} bytes, at most {MOST_SENT} are sent; use a shared folder")
+    content = {os.path.relpath(file, base): read_input(file, most=MOST_SENT) for file in files}
+    return msgspec.structs.replace(item, content=content)
 
 
 @contextlib.contextmanager

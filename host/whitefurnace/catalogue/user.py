@@ -8,6 +8,7 @@ from pathlib import Path
 from whitefurnace.catalogue.model import Model, Paper, Parameter
 from whitefurnace.catalogue.user_text import MARK, NUMBERS, VECTORS, Signature, UserText, decoded
 from whitefurnace.errors import FileError, InputError, UsageError, nearest
+from whitefurnace.files import read_input
 
 FORMS = {
     "ndf": ("D", "real", "real cos_m[, real sin2_m][, real p1, …]"),
@@ -20,6 +21,9 @@ CONSTANTS = ("per_norm", "lobe_width")
 _TAKEN = (*CONSTANTS, "area_scale", "area_per_range", "area_grazing", "area_terms")
 
 _INCLUDE = re.compile(r"^[ \t]*#[ \t]*include\b[ \t]*(.*?)[ \t]*(?://.*)?$", re.MULTILINE)
+
+MOST_BYTES = 1 << 20
+"""Largest size of a .clh file in bytes; the longest model of the catalogue has six thousand."""
 
 MOST_INCLUDES = 32
 """Largest number of files that one model may include, and depth of their nesting."""
@@ -79,10 +83,7 @@ def user_files(path: str | Path) -> list[Path]:
 
 
 def _read(path: Path) -> str:
-    try:
-        return decoded(path.read_bytes(), str(path))
-    except OSError as error:
-        raise FileError(f"{path}: cannot be read: {error.strerror}") from None
+    return decoded(read_input(path, "a .clh file", most=MOST_BYTES), str(path))
 
 
 def _with_includes(path: Path, folder: Path, files: list[Path], within: tuple[Path, ...] = ()) -> str:

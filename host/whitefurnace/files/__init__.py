@@ -15,6 +15,7 @@ from whitefurnace.files.gltf_lights import GltfLight, read_gltf_lights, write_gl
 from whitefurnace.files.harmonics import read_sh
 from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
 from whitefurnace.files.image import Image, decode_srgb, read_image, srgb_table
+from whitefurnace.files.inputs import head_of, input_size, is_input, open_input, read_input, read_text
 from whitefurnace.files.lights import Light, is_light, light_digest, light_files, read_light, read_radiance
 from whitefurnace.files.lock import Lock, acquire, is_lock, is_safe, lock_path, locks_in
 from whitefurnace.files.manifest import read_manifest, write_manifest
@@ -46,9 +47,12 @@ __all__ = [
     "decode_srgb",
     "digest_file",
     "encode",
+    "head_of",
     "identifier",
     "image_facts",
+    "input_size",
     "is_arrays",
+    "is_input",
     "is_light",
     "is_lock",
     "is_safe",
@@ -58,12 +62,14 @@ __all__ = [
     "lock_path",
     "locks_in",
     "number",
+    "open_input",
     "pack",
     "pack_hdr",
     "read_env",
     "read_gltf_lights",
     "read_header",
     "read_image",
+    "read_input",
     "read_light",
     "read_manifest",
     "read_npy",
@@ -72,6 +78,7 @@ __all__ = [
     "read_rgbd",
     "read_sh",
     "read_stored",
+    "read_text",
     "read_texture",
     "release",
     "require_encoder",

@@ -22,10 +22,14 @@ import numpy.typing as npt
 
 from whitefurnace.errors import InputError
 from whitefurnace.files.binary import MAX_BYTES, Source, load
+from whitefurnace.files.inputs import head_of, read_text
 
 NPY, ZIP = b"\x93NUMPY", b"PK\x03\x04"
 _ARRAY = re.compile(r"static const (?:float|double) \w+((?:\[\d{1,9}\]){1,8}) = \{")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
+_LONGEST_HEADER = 64 << 20
+"""Largest size of a C header in bytes: five million numbers."""
+
 _DENSEST = 1032
 """Largest number of bytes that one byte of deflated data can expand to [zlib: Maximum Expansion Factor]."""
 _READERS: dict[tuple[int, int], Callable[[Any], tuple[tuple[int, ...], bool, np.dtype[Any]]]] = {
@@ -99,11 +103,8 @@ def read_header(path: str | os.PathLike[str]) -> npt.NDArray[np.float64] | None:
 
     Returns None for a header that has macros and no array. Raises the same errors as `read_npy`.
     """
-    source = load(path)
-    try:
-        text = bytes(source.view).decode()
-    except UnicodeDecodeError:
-        raise source.wrong("it is no text in UTF-8") from None
+    text = read_text(path, "a C header", most=_LONGEST_HEADER)
+    source = Source(b"", str(path))
     found = _ARRAY.search(text)
     if found is None:
         if "#define" in text:
@@ -119,11 +120,7 @@ def read_header(path: str | os.PathLike[str]) -> npt.NDArray[np.float64] | None:
 
 def is_arrays(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is .npy by its first bytes, or .npz by its first bytes and its suffix."""
-    try:
-        with open(path, "rb") as file:
-            head = file.read(6)
-    except (OSError, ValueError):
-        return False
+    head = head_of(path, 6)
     return head == NPY or (head.startswith(ZIP) and Path(path).suffix.lower() == ".npz")
 
 

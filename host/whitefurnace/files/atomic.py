@@ -10,6 +10,7 @@ from pathlib import Path
 from types import TracebackType
 
 from whitefurnace.errors import FileError
+from whitefurnace.files.inputs import open_input
 
 
 class Transaction:
@@ -110,10 +111,7 @@ def write_pieces(
 def digest_file(path: str | os.PathLike[str]) -> str:
     """Return the sha256 of a file's bytes in hex. Raises `FileError` where it cannot be read."""
     digest = hashlib.sha256()
-    try:
-        with open(path, "rb") as file:
-            while block := file.read(1 << 20):
-                digest.update(block)
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+    with open_input(path) as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
     return digest.hexdigest()

@@ -6,13 +6,13 @@ Every access is checked against the file's real size first, so a wrong size in a
 from __future__ import annotations
 
 import os
-import stat
 import struct
 from collections.abc import Mapping
 from pathlib import Path
 
-from whitefurnace.errors import FileError, InputError
+from whitefurnace.errors import InputError
 from whitefurnace.files import memory
+from whitefurnace.files.inputs import input_size, open_input
 
 Buffer = bytes | memoryview
 
@@ -57,21 +57,13 @@ def load(path: str | os.PathLike[str]) -> Source:
     Raises `FileError` for a file that cannot be read, and `InputError` for one that is empty or larger than 8 GiB.
     """
     path = Path(path)
+    size = input_size(path, "a texture file")
+    if not 0 < size <= MAX_BYTES:
+        raise InputError(f"{path} has {size} bytes, a texture has 1 to {MAX_BYTES}")
+    memory.require(size, "its bytes", path, size)
     try:
-        status = os.stat(path)  # before opening: a pipe would block until it has a writer
-        if stat.S_ISDIR(status.st_mode):
-            raise FileError(f"cannot read {path}: it is a folder, a texture file was expected")
-        if not stat.S_ISREG(status.st_mode):
-            raise FileError(f"cannot read {path}: it is not a regular file")
-        if not 0 < status.st_size <= MAX_BYTES:
-            raise InputError(f"{path} has {status.st_size} bytes, a texture has 1 to {MAX_BYTES}")
-        memory.require(status.st_size, "its bytes", path, status.st_size)
-        with open(path, "rb") as file:
-            return Source(file.read(status.st_size), str(path))
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:  # a NUL or a lone surrogate in the name
-        raise FileError(f"cannot read {str(path)!r}: {error}") from error
+        with open_input(path, "a texture file") as file:
+            return Source(file.read(size), str(path))
     except MemoryError as error:
         raise InputError(f"{path} needs more memory than this machine gives") from error
 

@@ -12,6 +12,7 @@ from whitefurnace.errors import InputError, UnsupportedError
 from whitefurnace.files import dds, ktx1, ktx2
 from whitefurnace.files.atomic import Transaction
 from whitefurnace.files.binary import Source, load
+from whitefurnace.files.inputs import head_of
 from whitefurnace.files.texture import Texture
 
 _PARSERS = {ktx1.IDENTIFIER: ktx1.parse_ktx1, ktx2.IDENTIFIER: ktx2.parse_ktx2, dds.MAGIC: dds.parse_dds}
@@ -19,13 +20,7 @@ _PARSERS = {ktx1.IDENTIFIER: ktx1.parse_ktx1, ktx2.IDENTIFIER: ktx2.parse_ktx2, 
 
 def is_texture(path: str | os.PathLike[str]) -> bool:
     """Return whether a file is KTX 1, KTX 2 or DDS by its first bytes; False where it cannot be read."""
-    try:
-        if not Path(path).is_file():
-            return False
-        with open(path, "rb") as file:
-            head = file.read(12)
-    except (OSError, ValueError):
-        return False
+    head = head_of(path, 12)
     return any(head.startswith(magic) for magic in _PARSERS)
 
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction, write_atomic
+from whitefurnace.files.inputs import library_name
 
 ROWS_AT_ONCE = 1 << 24
 """Bytes of pixel rows passed to OpenImageIO in one call."""
@@ -41,11 +42,12 @@ def write_exr(
         with open(temporary, "wb"):
             pass
         try:
-            complaint = _write(temporary, pixels, channel_names, attributes or {})
-            if complaint is None and not _holds(temporary, pixels):
-                complaint = "what was written does not read back, the disk may be full"
+            with library_name(temporary) as name:
+                complaint = _write(Path(name), pixels, channel_names, attributes or {})
+                if complaint is None and not _holds(Path(name), pixels):
+                    complaint = "what was written does not read back, the disk may be full"
         except UnicodeError as error:
-            raise FileError(f"cannot write {str(path)!r}: its name or an attribute is not valid Unicode") from error
+            raise FileError(f"cannot write {path}: an attribute is not valid Unicode") from error
         if complaint is not None:
             raise FileError(f"cannot write {path}: {complaint}")
 

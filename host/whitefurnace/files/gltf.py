@@ -18,6 +18,7 @@ from whitefurnace.errors import FileError, InputError
 from whitefurnace.files.binary import Source, load
 from whitefurnace.files.gltf_lights import GLB_MAGIC, _document, _Images
 from whitefurnace.files.image import MAX_PIXELS, _check_size, _complaint, _reason
+from whitefurnace.files.inputs import head_of
 from whitefurnace.files.integrity import check_file
 from whitefurnace.files.jsontext import Reader
 from whitefurnace.files.png import _scratch_file
@@ -177,8 +178,7 @@ def _check_amount(source: Source) -> None:
 def _decoded(path: Path, size: int) -> Iterator[tuple[int, int, int, Codes]]:
     import OpenImageIO as oiio
 
-    with open(path, "rb") as file:
-        check_file(path, size, file.read(4096))
+    check_file(path, size, head_of(path, 4096))
     hints = oiio.ImageSpec()
     hints.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(str(path), hints)

@@ -13,9 +13,12 @@ import re
 import numpy as np
 import numpy.typing as npt
 
-from whitefurnace.files.binary import load
+from whitefurnace.files.binary import Source
+from whitefurnace.files.inputs import read_input
 
-_MAX_BYTES = 1 << 16
+MAX_BYTES = 1 << 16
+"""Largest size of such a text in bytes; cmgen writes about 700."""
+
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 
 
@@ -25,9 +28,7 @@ def read_sh(path: str | os.PathLike[str]) -> npt.NDArray[np.float64]:
     Raises `FileError` for a file that cannot be read, and `InputError` for one that does not have nine lines, or nine
     names, of three finite numbers.
     """
-    source = load(path)
-    if len(source) > _MAX_BYTES:
-        raise source.wrong(f"it has {len(source)} bytes, nine rows of numbers have fewer than {_MAX_BYTES}")
+    source = Source(read_input(path, "a text of nine coefficients", most=MAX_BYTES), str(path))
     rows: list[list[float]]
     try:
         text = bytes(source.view).decode()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -24,6 +23,7 @@ from whitefurnace.files.atomic import digest_file
 from whitefurnace.files.colour import LINEAR, SRGB_CURVE, Encoding
 from whitefurnace.files.declared import Declared, read_declared
 from whitefurnace.files.hdr_header import Radiance, read_radiance_header
+from whitefurnace.files.inputs import head_of, library_name, open_input
 from whitefurnace.files.integrity import check_file
 from whitefurnace.files.png import _scratch_file
 
@@ -111,19 +111,8 @@ def read_image(path: str | os.PathLike[str]) -> Image:
 
 
 def _regular_size(path: Path) -> int:
-    try:
-        status = os.stat(path)
-        if stat.S_ISDIR(status.st_mode):
-            raise FileError(f"cannot read {path}: it is a folder, an image file was expected")
-        if not stat.S_ISREG(status.st_mode):
-            raise FileError(f"cannot read {path}: it is not a regular file")
-        with open(path, "rb"):
-            pass
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
-    except ValueError as error:  # a NUL or a lone surrogate in the name
-        raise FileError(f"cannot read {str(path)!r}: {error}") from error
-    return status.st_size
+    with open_input(path, "an image file") as file:
+        return os.fstat(file.fileno()).st_size
 
 
 @dataclass(frozen=True)
@@ -163,8 +152,7 @@ def opened(path: Path, size: int, *, unassociated: bool = False) -> Iterator[Ope
     if unassociated:
         hints.attribute("oiio:UnassociatedAlpha", 1)
     with contextlib.ExitStack() as stack:
-        with open(path, "rb") as file:
-            head = file.read(4096)
+        head = head_of(path, 4096)
         check_file(path, size, head)
         radiance = read_radiance_header(path) if head.startswith(b"#?") else None
         shown = path
@@ -173,10 +161,8 @@ def opened(path: Path, size: int, *, unassociated: bool = False) -> Iterator[Ope
             if flat is not None or not radiance.plain:
                 path = stack.enter_context(_scratch_file(".hdr"))
                 radiance.rewrite(shown, path, flat)
-        try:
-            source = oiio.ImageInput.open(str(path), hints)
-        except (UnicodeError, TypeError) as error:  # a name that is not Unicode is no string to the binding
-            raise FileError(f"cannot read {str(path)!r}: its name is not valid Unicode") from error
+        path = Path(stack.enter_context(library_name(path)))
+        source = oiio.ImageInput.open(str(path), hints)
         complaint = _complaint(oiio)  # fetched even without a failure: else it is printed at exit
         if source is None:
             raise _not_opened(complaint, path, shown, head)

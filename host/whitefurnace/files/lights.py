@@ -18,7 +18,7 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
-from whitefurnace.errors import InputError, UnsupportedError
+from whitefurnace.errors import FileError, InputError, UnsupportedError
 from whitefurnace.files import ktx1, ktx2
 from whitefurnace.files.atomic import digest_file
 from whitefurnace.files.binary import Source, load
@@ -27,6 +27,7 @@ from whitefurnace.files.containers import is_texture, parse_texture
 from whitefurnace.files.env import MAGIC as ENV_MAGIC
 from whitefurnace.files.env import parse_env
 from whitefurnace.files.gltf_lights import GLB_MAGIC, read_gltf_lights
+from whitefurnace.files.inputs import head_of, read_input
 from whitefurnace.files.packing import FORMATS
 from whitefurnace.files.texture import Texture, upright
 
@@ -73,13 +74,7 @@ def is_light(path: str | os.PathLike[str]) -> bool:
 
 
 def _kind(path: str | os.PathLike[str]) -> str | None:
-    try:
-        if not Path(path).is_file():
-            return None
-        with open(path, "rb") as file:
-            head = file.read(8)
-    except (OSError, ValueError):
-        return None
+    head = head_of(path, 8)
     if head == ENV_MAGIC:
         return "env"
     return "gltf" if head.startswith(GLB_MAGIC) or Path(path).suffix.lower() in (".gltf", ".glb") else None
@@ -224,9 +219,9 @@ def light_files(path: str | os.PathLike[str]) -> list[Path]:
     """List the file, and for a .gltf the image and buffer files that it refers to."""
     path = Path(path)
     try:
-        document = json.loads(path.read_bytes()) if path.suffix.lower() == ".gltf" else {}
+        document = json.loads(read_input(path, "a glTF", most=1 << 30)) if path.suffix.lower() == ".gltf" else {}
         uris = [entry.get("uri", "data:") for part in ("images", "buffers") for entry in document.get(part, ())]
-    except (OSError, ValueError, AttributeError, TypeError, RecursionError):
+    except (FileError, InputError, ValueError, AttributeError, TypeError, RecursionError):
         return [path]
     return [path, *(path.parent / unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:"))]
 

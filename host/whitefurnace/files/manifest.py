@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 
-from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction, write_atomic
+from whitefurnace.files.inputs import input_size, is_input, read_input
 
 # A manifest lists a few files; what is larger than this is somebody else's.
 _MAX_BYTES = 64 << 20
@@ -25,11 +25,9 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
     """
     path = Path(path)
     try:
-        if not path.is_file() or path.stat().st_size > _MAX_BYTES:
+        if not is_input(path) or input_size(path) > _MAX_BYTES:
             return None
-        found = json.loads(path.read_bytes())
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
+        found = json.loads(read_input(path, "a manifest", most=_MAX_BYTES))
     except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
         return None
     return found if isinstance(found, dict) and "whitefurnace" in found else None

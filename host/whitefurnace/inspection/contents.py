@@ -23,6 +23,7 @@ from whitefurnace.files import (
     image_facts,
     is_arrays,
     is_light,
+    open_input,
     read_header,
     read_image,
     read_light,
@@ -32,7 +33,9 @@ from whitefurnace.files import (
     read_rgbd,
     read_sh,
     read_stored,
+    read_text,
 )
+from whitefurnace.files.harmonics import MAX_BYTES as SH_BYTES
 from whitefurnace.sphere.environments import cube_solid_angles, faces_of, latlong_solid_angles
 from whitefurnace.sphere.harmonics import SCALINGS, unscaled
 
@@ -178,12 +181,8 @@ def contents(path: str | os.PathLike[str]) -> Contents:
 
 
 def _of_manifest(path: Path) -> Contents:
-    try:
+    with open_input(path, "a manifest"):
         size = path.stat().st_size
-        with open(path, "rb"):
-            pass
-    except (OSError, ValueError) as error:
-        raise FileError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
     found = read_manifest(path)
     if found is None:
         raise InputError(f"{path} is not a manifest of whitefurnace, which is JSON and begins with its version")
@@ -218,7 +217,7 @@ def _of_harmonics(path: Path, statement: Statement | None) -> Contents:
     values = read_sh(path)
     stated = statement.stated.get("scale") if statement is not None else None
     scale = stated if isinstance(stated, str) and stated in SCALINGS else None
-    if scale is None and b"pre-scaled base" in path.read_bytes():
+    if scale is None and "pre-scaled base" in read_text(path, "a text of coefficients", most=SH_BYTES):
         scale = "filament"
     notices = () if scale else ("nothing says the scale of the coefficients; they are taken as the radiance's",)
     return Contents(

@@ -32,7 +32,8 @@ from whitefurnace.engines.engine import (
     check,
     reduced,
 )
-from whitefurnace.errors import FileError, InputError, UsageError, nearest
+from whitefurnace.errors import InputError, UsageError, nearest
+from whitefurnace.files import read_text
 
 
 def _presets() -> dict[str, Preset]:
@@ -107,15 +108,7 @@ def user_engine(path: str | os.PathLike[str]) -> Engine:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path} has {path.stat().st_size} bytes, an engine's description at most {MOST_BYTES}")
-        text = path.read_bytes().decode()
-    except OSError as error:
-        raise FileError(f"cannot read {path}: {error.strerror or error}") from error
-    except UnicodeDecodeError:
-        raise InputError(f"{path} is not UTF-8") from None
-    try:
-        data = tomllib.loads(text)
+        data = tomllib.loads(read_text(path, "the description of an engine", most=MOST_BYTES))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InputError(f"{path} is not TOML: {error}") from None
     for key in ("name", "proven", "container", "latlong", "without", "facts"):
