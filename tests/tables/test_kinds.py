@@ -28,6 +28,7 @@ from whitefurnace.tables.request import TableRequest
 TABLES = Path(whitefurnace.__file__).parent / "tables"
 
 NEW_KIND = '''"""The mean Fresnel term of a clear coat, by its index of refraction, and what it leaves to the base."""
+
 from __future__ import annotations
 
 from whitefurnace.tables.kind import Kind

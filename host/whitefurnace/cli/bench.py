@@ -36,7 +36,7 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device o
 130 interrupted.
 """
 
-MEASUREMENT, TRADEOFF = "Measurement", "Of tradeoff"
+MEASUREMENT, TRADEOFF = "Measurement", "Options of tradeoff"
 
 
 @options.command("Prove and measure", "Measure the speed of kernels, or error against time", EPILOG)

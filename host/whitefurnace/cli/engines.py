@@ -62,7 +62,7 @@ def engines_text(engines: Sequence[Engine]) -> str:
         ]
         for e in engines
     ]
-    return table(["engine", "of", "proven", "lod(r)", "harmonics", "table"], rows, left=6)
+    return table(["engine", "description", "proven", "lod(r)", "harmonics", "table"], rows, left=6)
 
 
 def engine_text(engine: Engine) -> str:

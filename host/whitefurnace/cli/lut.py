@@ -50,7 +50,7 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device o
 7 a check failed, 130 interrupted.
 """
 
-OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of the kind radiance", "Accuracy"
+OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light (for the kind radiance)", "Accuracy"
 
 
 @options.command("Bake and tabulate", "Tabulate an integral of a BRDF over roughness and view angle", EPILOG, HELP)
@@ -69,7 +69,8 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of t
     "for_",
     metavar="ENGINE",
     heading=OUTPUT,
-    help="Use the size, axes, form and sheen that an engine reads (see `whitefurnace engines`). Of dfg and sheen.",
+    help="Use the size, axes, form and sheen that an engine reads (see `whitefurnace engines`). Only for dfg and "
+    "sheen.",
 )
 @options.option(
     "--scheme",
@@ -121,11 +122,14 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light, of t
     "--diffuse",
     metavar="NAME[:p=v,...]",
     heading=MODELS,
-    help="Diffuse model, added to the specular reflection of --ndf, or alone without --ndf. Of albedo and "
-    "albedo_average.",
+    help="Diffuse model, added to the specular reflection of --ndf, or alone without --ndf. Only for albedo "
+    "and albedo_average.",
 )
 @options.option(
-    "--brdf", metavar="FILE.clh", heading=MODELS, help="A whole BRDF of your own, in RGB. Of albedo and albedo_average."
+    "--brdf",
+    metavar="FILE.clh",
+    heading=MODELS,
+    help="A whole BRDF of your own, in RGB. Only for albedo and albedo_average.",
 )
 @options.light("Light source", heading=LIGHT)
 @options.option("--environment", metavar="ENV", heading=LIGHT, help="Environment image in place of a light, in RGB.")

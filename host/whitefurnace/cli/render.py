@@ -33,19 +33,19 @@ MANIFEST is the STEM.json of a bake. Roughness goes from 0 to 1 across, metalnes
 spheres are seen in parallel along -z with +y up; behind them is level 0, as a camera of 60 degrees sees it. The picture
 is in sRGB: radiance times 2^exposure, clipped at 1, without a tone curve.
 
-With --truth, the image that the bake was made of, there are three panels: what the engine shows, the full reflectance
-integral of the same pixels, and their difference over the truth. An .exr holds them as layers of float32, in linear
-radiance. A light's place and directions are in the frame of the viewer (+z to the viewer, +x right), in radii of a
-sphere about its middle; lights are added to both pictures alike.
+With --truth, the image that the bake was made from, the picture has three panels: what the engine shows, the full
+reflectance integral of the same pixels, and their difference over the truth. An .exr holds them as layers of float32,
+in linear radiance. A light's place and directions are in the frame of the viewer (+z to the viewer, +x right), in radii
+of a sphere about its middle; lights are added to both pictures alike.
 
-With --scene there is a sphere for each of a glTF's materials (at most 64), in the order of the file and with the mean
-of what its textures have in use, --columns to a row. What a sphere leaves out of its material is a notice.
+With --scene the picture has a sphere for each of a glTF's materials (at most 64), in the order of the file, --columns
+to a row. A sphere has the mean values of the texture parts that are in use. Notices list what it leaves out.
 
 Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 4 device or build, 5 not supported (an engine that
 is given no prefiltered chain), 130 interrupted.
 """
 
-OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Truth beside the engine's picture"
+OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Comparison with the truth"
 
 
 @options.command("Look and compare", "Draw spheres from baked files as an engine shades them", EPILOG)
@@ -152,7 +152,7 @@ OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Truth beside the engine's picture
     heading=TRUTH,
     help="Diffuse model, as oren_nayar:sigma=.5; see `whitefurnace models`. [default: lambert]",
 )
-@options.light("Further light beside the environment (may be repeated)", multiple=True, heading=TRUTH)
+@options.light("Further light in addition to the environment (may be repeated)", multiple=True, heading=TRUTH)
 @options.device(TRUTH)
 @options.memory()
 @options.force("Overwrite FILE if it exists.")

@@ -25,7 +25,7 @@ Examples:
   whitefurnace verify my_lobe.clh:alpha=.3 my_brdf.clh:roughness=.5 --json
 
 A row is the worst cell of a check: its value, the expected value or bound, the error and the tolerance, all absolute.
-The entry of a model says what is checked; `whitefurnace models NAME` shows it. The verdict `told` marks a value that is
+The entry of a model says what is checked; `whitefurnace models NAME` shows it. The verdict `info` marks a value that is
 measured for information and has no tolerance. A FILE.clh defines ndf_STEM_D or brdf_STEM_f; give all its parameters.
 
 Exit codes: 0 all passed, 1 usage, 2 cannot read or write, 3 invalid input (an NDF that cannot be normalized), 4 device
@@ -112,7 +112,7 @@ def verify_text(rows: Sequence[Row]) -> str:
     """Return the lines below `VERIFY_HEAD` for one model: the worst cell of each check, and counterexamples."""
     lines = [f"{rows[0].slot} {rows[0].model}"]
     for row in rows:
-        verdict = "FAIL" if not row.passed else "pass" if row.tolerance is not None else "told"
+        verdict = "FAIL" if not row.passed else "pass" if row.tolerance is not None else "info"
         expected, error, tolerance = (
             "" if x is None else format(x, digits)
             for x, digits in ((row.expected, ".8g"), (row.error, ".1e"), (row.tolerance, ".1e"))
@@ -142,7 +142,7 @@ def verify_summary(rows: Sequence[Row], seconds: float, device: str) -> str:
     return (
         f"{len(rows) - informational} checks of {subjects} {'model' if subjects == 1 else 'models'}: "
         f"{len(rows) - informational - failed} passed, {failed} failed"
-        + (f"; {informational} figures told" if informational else "")
+        + (f"; {informational} informational {'value' if informational == 1 else 'values'}" if informational else "")
         + f"; {seconds:.1f} s on {device}"
     )
 

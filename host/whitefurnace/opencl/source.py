@@ -176,7 +176,7 @@ PROGRAMS: Mapping[str, Assembly] = {
     "built-in environment": Assembly(("real.clh", "demo.cl")),
     "limits of a device": Assembly(("real.clh", "yardstick.cl")),
 }
-"""Every program: its kernel files, the slots that it binds, and what its kernels are told."""
+"""Every program: its kernel files, the slots that it binds, and the macros that its kernels get."""
 
 
 _CONSTANTS: Mapping[str, Callable[[], str]] = {

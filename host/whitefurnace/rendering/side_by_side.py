@@ -338,16 +338,16 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
     written = shading.dictionary(read_manifest(Path(manifest)))
     recipe, source = shading.dictionary(written.get("recipe")), shading.dictionary(written.get("source"))
     item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
-    told: dict[str, float] = {}
+    stated: dict[str, float] = {}
     for name in ("rotate", "exposure"):
         value = recipe.get(name)
         if not isinstance(value, (int, float)):
-            raise InputError(f"{manifest} tells no {name}: it is not the manifest of a bake")
-        told[name] = float(value)
+            raise InputError(f"{manifest} does not state {name}: it is not the manifest of a bake")
+        stated[name] = float(value)
     found = environment(
         item,
-        rotate=told["rotate"],
-        exposure=told["exposure"],
+        rotate=stated["rotate"],
+        exposure=stated["exposure"],
         nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse",
     )
     if found.digest != source.get("sha256"):

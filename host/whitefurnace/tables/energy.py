@@ -156,7 +156,7 @@ def _apart(values: np.ndarray) -> float:
 def sheen(report: bool, **what: Any) -> tuple[Integrated, dict[str, Any]]:
     """Albedo E(v) and its average E_avg, (…, 2), of a sheen of colour 1, which scale the layer below. [Estevez2017]
 
-    what: arguments of `integrate`. A sheen that reflects more than arrives somewhere is told in a notice.
+    what: arguments of `integrate`. A notice names a sheen that reflects more than arrives somewhere.
     """
     own = {**what, "out": None}
     E = integrate("albedo", **own)

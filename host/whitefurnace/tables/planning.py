@@ -179,11 +179,13 @@ def _check_axes(kind: Kind, path: Path, axes: tuple[Axis, ...], request: TableRe
     as_read = request.as_read or request.fit is not None
     if as_read and not kind.refittable:
         raise UsageError(
-            f"{kind.name} is a fit by itself, and states what is misplaced between texels: leave out "
-            "--fit and --as-read"
+            f"{kind.name} is fitted already, and states its error between texels: leave out --fit and --as-read"
         )
     if as_read and not (len(axes) == 2 and all(FITTED[0] <= a.count <= FITTED[1] for a in axes)):
-        raise UsageError(f"what is read between texels is told of tables with two axes of {FITTED[0]} to {FITTED[1]}")
+        raise UsageError(
+            f"the error of reads between texels is measured only for tables with two axes of {FITTED[0]} to "
+            f"{FITTED[1]} texels"
+        )
     return as_read
 
 

@@ -16,8 +16,8 @@ PRESET = Preset(
         bend="alpha",
         file=(File("environment", "{stem}.hdr"),),
         steps=(
-            "import STEM.hdr as a PanoramaSkyMaterial's panorama; the sky is filtered by the engine, of our work "
-            "its energy, its turn and its extracted sun survive",
+            "import STEM.hdr as a PanoramaSkyMaterial's panorama; Godot filters the sky; the energy, the "
+            "rotation and the extracted sun of the bake survive",
         ),
     ),
 )

@@ -14,9 +14,9 @@ PRESET = Preset(
         levels=7,
         file=(File("environment", "{stem}.exr"), File("specular", "{stem}_cube.dds", "rgba16f")),
         steps=(
-            "import STEM.exr with Texture Shape: Cube, Mapping: Latitude-Longitude, Convolution Type: Specular; it "
-            "is filtered then, and of our work its energy, its turn and its extracted sun survive",
-            "with Convolution Type: None it stays; Cubemap.SetPixelData can set the levels of STEM_cube.dds",
+            "import STEM.exr with Texture Shape: Cube, Mapping: Latitude-Longitude, Convolution Type: Specular; Unity "
+            "filters it then; the energy, the rotation and the extracted sun of the bake survive",
+            "with Convolution Type: None it stays unfiltered; Cubemap.SetPixelData can set the levels of STEM_cube.dds",
         ),
     ),
 )

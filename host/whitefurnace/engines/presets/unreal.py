@@ -17,8 +17,8 @@ PRESET = Preset(
         file=(File("environment", "{stem}.hdr"), File("specular", "{stem}_cube.dds", "rgba16f")),
         steps=(
             "import STEM.hdr: it becomes a TextureCube; an .exr stays 2-D",
-            "a Sky Light of source type SLS Specified Cubemap filters it again: of our work its energy, its turn "
-            "and its extracted sun survive, the levels do not",
+            "a Sky Light of source type SLS Specified Cubemap filters it again: the energy, the rotation and "
+            "the extracted sun of the bake survive, the levels do not",
             "STEM_cube.dds holds levels for its mapping, for shaders that sample a TextureCube themselves",
         ),
     ),
