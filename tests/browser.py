@@ -179,6 +179,9 @@ def glb(meshes: Sequence[Mapping[str, Any]]) -> bytes:
                 },
             }
         )
+        if "sheen" in mesh:
+            own = {"sheenColorFactor": mesh["sheen"]["color"], "sheenRoughnessFactor": mesh["sheen"]["roughness"]}
+            materials[-1]["extensions"] = {"KHR_materials_sheen": own}
         made.append(
             {
                 "primitives": [
@@ -194,6 +197,7 @@ def glb(meshes: Sequence[Mapping[str, Any]]) -> bytes:
             "nodes": [{"mesh": k} for k in range(len(made))],
             "meshes": made,
             "materials": materials,
+            **({"extensionsUsed": ["KHR_materials_sheen"]} if any("sheen" in mesh for mesh in meshes) else {}),
             "accessors": accessors,
             "bufferViews": views,
             "buffers": [{"byteLength": len(blob)}],

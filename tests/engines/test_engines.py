@@ -24,13 +24,15 @@ import pytest
 
 import reference
 from browser import Answer, PageError, chromium, glb, rendered
+from whitefurnace.catalogue import model
 from whitefurnace.engines.presets import ENGINES, Engine
 from whitefurnace.files import decode
 from whitefurnace.files.codec import encode
 from whitefurnace.files.containers import read_texture, write_texture
 from whitefurnace.files.env import EnvMap, read_env, write_env
 from whitefurnace.files.exr import write_exr
-from whitefurnace.files.png import write_png
+from whitefurnace.files.packing import unpack
+from whitefurnace.files.png import decode_png, write_png
 from whitefurnace.files.texture import text_value
 from whitefurnace.prefiltering.reading import bilinear
 from whitefurnace.rendering.shading import irradiance, read_lights, shade, specular, split_sum
@@ -121,6 +123,11 @@ ROUGHNESS = (0.0, 0.25, 0.5, 0.75, 1.0)
 MATERIALS = (*((White, 1.0, r) for r in ROUGHNESS), (Gold, 1.0, 0.5), (White, 0.0, 0.5), (White, 0.0, 1.0))
 """Base colour, metallic, roughness."""
 
+BLACK, GREY = (((x, x, x), 0.0, 0.5) for x in (0.0, 0.5))
+SHEENS = ((White, 0.25), (White, 0.5), (White, 1.0), (Gold, 0.4), (White, 0.5))
+BELOW = (BLACK, BLACK, BLACK, BLACK, GREY)
+"""Colour and roughness of sheens, and the materials under them."""
+
 VIEWS = (np.array([0.2, 0.3, 0.933]), np.array([-0.48, -0.6, -0.64]))
 TILE = 8
 FAR = 100.0
@@ -159,15 +166,15 @@ class Scene:
         return tiles[:rows, TILE // 2, :columns, TILE // 2]
 
 
-def tiles(view: np.ndarray) -> Scene:
+def tiles(view: np.ndarray, materials: Sequence[Any] = MATERIALS, sheens: Sequence[Any] = ()) -> Scene:
     """A wall of flat tiles seen from far off, a material in a row and a normal in a column: unlike on a sphere, the
     normal of a pixel is known, and no derivative of it roughens anything."""
     v, right, up = frame(view)
     normals = normals_about(view)
-    n = max(len(normals), len(MATERIALS))
+    n = max(len(normals), len(materials))
     eye = FAR * n / 2 * v
-    meshes, views = [], np.empty((len(MATERIALS), len(normals), 3))
-    for row, (color, metallic, roughness) in enumerate(MATERIALS):
+    meshes, views = [], np.empty((len(materials), len(normals), 3))
+    for row, (color, metallic, roughness) in enumerate(materials):
         positions = []
         for column in range(len(normals)):
             corners = [
@@ -188,6 +195,8 @@ def tiles(view: np.ndarray) -> Scene:
                 "roughness": roughness,
             }
         )
+        if sheens:
+            meshes[-1]["sheen"] = dict(zip(("color", "roughness"), sheens[row], strict=True))
     camera = {
         "eye": eye.tolist(),
         "target": [0, 0, 0],
@@ -200,6 +209,7 @@ def tiles(view: np.ndarray) -> Scene:
 
 
 SCENES = [tiles(view) for view in VIEWS]
+CLOTHS = tiles(VIEWS[0], BELOW, SHEENS)
 
 BALLS = 5
 BALL_SIZE = 320
@@ -492,7 +502,7 @@ def engine(request, node_modules, baked, tmp_path_factory) -> Rendered:
     files["light"] = folder / name
     shutil.copy(baked / preset.name / name, files["light"])
     jobs = []
-    for file, scenes in (("levels", SCENES[:1]), ("furnace", SCENES[:1]), ("light", [*SCENES, balls()])):
+    for file, scenes in (("levels", SCENES[:1]), ("furnace", [SCENES[0], CLOTHS]), ("light", [*SCENES, balls()])):
         for k, scene in enumerate(scenes):
             geometry = folder / f"{file}{k}.glb"
             geometry.write_bytes(glb(scene.job["meshes"]))
@@ -504,6 +514,10 @@ def engine(request, node_modules, baked, tmp_path_factory) -> Rendered:
                     "glb": f"/files/{geometry.name}",
                 }
             )
+    if preset.name == "babylon":  # the one of the three that can be given a table
+        shutil.copy(baked / preset.name / "light_dfg.png", folder)
+        cloth = next(job for job in jobs if job["name"] == "furnace1")
+        jobs.append({**cloth, "name": "table", "table": "/files/light_dfg.png"})
     answer = rendered(preset.name, jobs, node_modules, folder)
     for name, image in answer.images.items():
         shown = np.clip(image, 0, 1)
@@ -539,6 +553,84 @@ def test_a_furnace_shows_what_the_engine_keeps_of_it(engine):
     agree(got, engine.wanted("furnace", SCENES[0]), 4 * CANVAS, engine.engine.name)
     # A white metal is exactly white in all three, whatever its roughness.
     assert np.abs(got[:5] - 1).max() <= 2 * CANVAS
+
+
+def fit_of_three(nov: np.ndarray, roughness: float) -> np.ndarray:
+    """IBLSheenBRDF of three.js (lights_physical_pars_fragment)."""
+    inverse = 1 / (roughness + 0.1)
+    a = -1.9362 + 1.0678 * roughness + 0.4573 * roughness**2 - 0.8469 * inverse
+    b = -0.6014 + 0.5538 * roughness - 0.4670 * roughness**2 - 0.1255 * inverse
+    return np.clip(np.exp(a * nov + b), 0, 1)
+
+
+def charlie_by_tanh_sinh(nov: np.ndarray, roughness: float) -> np.ndarray:
+    """The albedo of Charlie under Neubelt's V, by another quadrature than ours."""
+    D, V = model("ndf", "charlie").reference["D"], model("masking", "ashikhmin").reference["V"]
+
+    def at(c: float) -> float:
+        zero = lambda up: np.zeros_like(up)  # noqa: E731
+        return reference.albedo_by_tanh_sinh(lambda t: D(t, alpha=roughness**2), V, lambda c: 1.0, zero, c)
+
+    return np.array([at(float(c)) for c in nov])
+
+
+def sheens_in_a_furnace(
+    engine: Rendered, table: Table, albedo: Callable[[np.ndarray, float], np.ndarray]
+) -> np.ndarray:
+    """(sheens, normals, 3): each sheen in light of 1, c E + (1 - max c E) of what is below, as all three engines do it.
+
+    Under a sheen the glTF materials of Filament's JavaScript build are matte: they reflect diffuse light alone."""
+
+    def one(directions: np.ndarray, *_: float) -> np.ndarray:
+        return np.ones((len(directions), 3))
+
+    found = []
+    for (color, roughness), base, n, v in zip(SHEENS, BELOW, CLOTHS.normals, CLOTHS.views, strict=True):
+        below = shaded(engine.engine, base, n, v, Chain(5, 128), one, one, table)
+        if engine.engine.name == "filament":
+            below = np.broadcast_to(base[0], below.shape)
+        E = albedo((n * v).sum(-1), roughness)[:, None]
+        found.append(np.asarray(color) * E + (1 - max(color) * E) * below)
+    return np.array(found)
+
+
+def test_a_sheen_in_a_furnace_is_shaded_as_the_preset_says(engine):
+    """Babylon.js and Filament by a table of Charlie under Neubelt's V, three.js by its fit."""
+    name, albedo, tolerance = engine.engine.name, fit_of_three, 4 * CANVAS
+    if name == "babylon":
+        size = engine.answer.about["dfg"]["size"]
+        own = np.array(engine.answer.about["dfg"]["floats"]).reshape(size, size, 4)
+        albedo = lambda nov, r: bilinear_table(own, nov, np.full(nov.shape, r))[:, 2]  # noqa: E731
+        # What is in its table, beside how it is read: 8 bits with a divisor are a step of 1e-2 at 1.
+        for r in (0.25, 0.5, 1.0):
+            nov = np.linspace(0.1, 0.95, 18)
+            assert np.abs(albedo(nov, r) - charlie_by_tanh_sinh(nov, r)).max() <= 1e-2, r
+    elif name == "filament":
+        # Its table of 64² is one row off and has 1024 samples a texel.
+        albedo = lambda nov, r: charlie_by_tanh_sinh(nov, min(r + 1 / 64, 1.0))  # noqa: E731
+        tolerance = 5e-3
+    want = sheens_in_a_furnace(engine, engine.table, albedo)
+    got = CLOTHS.values(engine.answer.images["furnace1"])
+    np.testing.assert_allclose(got, want, rtol=0, atol=tolerance)
+
+
+def test_babylon_reads_the_table_of_a_bake(engine, baked):
+    """STEM_dfg.png as the scene's environmentBRDFTexture: its three channels shade what is below and the sheen."""
+    if engine.engine.name != "babylon":
+        pytest.skip("it cannot be given a table")
+    code = decode_png((baked / "babylon" / "light_dfg.png").read_bytes())
+    ours = unpack("rgbd", code, code.shape[:-1]).astype(np.float64)
+
+    def table(nov: np.ndarray, roughness: float) -> tuple[np.ndarray, np.ndarray]:
+        found = bilinear_table(ours, nov, np.full(nov.shape, roughness))
+        return found[:, 0], found[:, 1]
+
+    got = CLOTHS.values(engine.answer.images["table"])
+    read = sheens_in_a_furnace(engine, table, lambda nov, r: bilinear_table(ours, nov, np.full(nov.shape, r))[:, 2])
+    np.testing.assert_allclose(got, read, rtol=0, atol=4 * CANVAS)
+    # And what is right: albedos up to .8 in steps of 8 bits.
+    right = sheens_in_a_furnace(engine, table, charlie_by_tanh_sinh)
+    np.testing.assert_allclose(got, right, rtol=0, atol=1e-2)
 
 
 def test_the_bake_is_read_as_the_preset_says(engine):

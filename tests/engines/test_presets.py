@@ -3,6 +3,7 @@ what the project's own arrays say."""
 
 from __future__ import annotations
 
+import ast
 import itertools
 import json
 import math
@@ -118,6 +119,16 @@ def test_a_table_is_piecewise_linear():
 
 
 # ------------------------------------------------------------------------------------------------- mappings
+
+
+def test_what_is_called_seen_is_what_an_engine_test_renders():
+    tree = ast.parse(Path(__file__).with_name("test_engines.py").read_text("utf-8"))
+    (names,) = (
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "NAMES"
+    )
+    assert {name for name, engine in ENGINES.items() if engine.proven} == set(names)
 
 
 @pytest.mark.parametrize("name", LOADED)

@@ -116,7 +116,8 @@ class Engine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True)
     """The files that an engine loads and how it reads them.
 
     name, title: its name in paths and on the command line, and a line that says what it loads.
-    facts: sources of the description. proven: whether the engine itself has loaded and rendered its files.
+    facts: sources of the description. proven: True if a test has the engine itself render its
+        chain; `facts` names the files that were tried.
     lod: level that is read at a roughness: a formula of LOD_NAMES, or pairs (r, lod); clamped to the existing levels.
     follow: True if levels past r = 1 hold a lobe of that α; False if they hold the lobe of r = 1.
     axes: "+x +y +z"; the engine reads the stored cube at (±x|y|z, …) for a world direction.

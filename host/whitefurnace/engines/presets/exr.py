@@ -11,6 +11,5 @@ PRESET = Preset(
         container="exr",
         latlong=True,
         facts="this project's own",
-        proven=True,
     ),
 )

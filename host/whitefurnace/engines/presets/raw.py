@@ -10,6 +10,5 @@ PRESET = Preset(
         title="numpy arrays in one .npz, GL-direct faces",
         container="npz",
         facts="this project's own",
-        proven=True,
     ),
 )

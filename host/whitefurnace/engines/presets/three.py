@@ -11,7 +11,7 @@ PRESET = Preset(
     ),
     engine=Engine(
         title="three.js from r187: a KTX 2 cube of half floats that needs no filtering, and an .hdr",
-        facts="loaded and rendered by three.js",
+        facts="three.js r187 rendered STEM.ktx2; the .hdr and the table were not tried",
         proven=True,
         axes="-x +y +z",
         bend="alpha * alpha",
