@@ -165,7 +165,7 @@ class Panel:
 
 
 Page = Sequence[tuple[float, Sequence[Panel]]]
-"""Rows of panels with their heights, inches."""
+"""Rows of panels, each with its height in inches."""
 
 HEAD, ABOVE, BELOW, LEFT = 0.75, 0.5, 0.65, 0.87
 LEAST = 10.0  # least width of a page, inches: room for the heading

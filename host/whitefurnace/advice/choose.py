@@ -19,8 +19,8 @@ from whitefurnace.prefiltering.recipe import Chain, chain
 TOLERANCE_RANGE = (1e-4, 1.0)
 
 FILTERS = (1e-2, 1e-3)
-"""Tolerances of the filter that are tried. Finer ones cost more, and reading between texels and levels hides their
-gain."""
+"""Tolerances of the filter that are tried. Finer ones take longer, and reads between texels and levels hide their gain.
+"""
 
 SIZES = (32, 64, 128, 256, 512)
 TABLES = (16, 32, 64, 128, 256)

@@ -29,15 +29,15 @@ NEGLIGIBLE = 1 / 510
 """Half a step of 8 bits, in units of white. A weight below it changes no pixel."""
 
 TABLE = 128
-"""Texels a side of the smallest split-sum table, a power of two, whose bilinear reads err by at most NEGLIGIBLE (p99
+"""Texels on a side of the smallest split-sum table, a power of two, whose bilinear reads err by at most NEGLIGIBLE (p99
 over n·v and r, GGX under Smith's masking: 7e-4, over r > .7 1.4e-3; a table of 64² errs by 3e-3 to 5e-3). The largest
-errors are at n·v below half a texel, whatever the roughness; so a scene's roughness values allow no smaller table."""
+errors are at n·v below half a texel at every roughness, so no scene allows a smaller table."""
 
 TEXEL = math.pi / 512
 """Angle of a texel of a 1K environment. The plan's products do not depend on it."""
 
 GLASS = 32
-"""Cells a side of a table of rough glass for one index of refraction."""
+"""Cells on a side of a table of rough glass for one index of refraction."""
 
 Kind = Literal["level", "lobe", "integral", "table", "file", "effect"]
 

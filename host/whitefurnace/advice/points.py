@@ -27,7 +27,7 @@ IORS = 4
 """Largest number of distinct indices of refraction among the points."""
 
 GRAZING = 0.01
-"""Smallest n·v of a point: a pixel at the rim of a sphere of 100 pixels is seen no flatter."""
+"""Smallest n·v of a point, about that of a pixel at the rim of a sphere of 100 pixels."""
 
 
 @dataclass(frozen=True)

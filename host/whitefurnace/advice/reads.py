@@ -38,6 +38,7 @@ class Storage:
 
     @classmethod
     def of(cls, engine: Engine) -> Storage:
+        """Return the storage of an engine's files."""
         if engine.container != "files":
             return cls("float32", "float32", ("sh" if "irradiance" in engine.without else "cube", "float32"))
         files = {holds: engine.holding(holds) for holds in ("specular", "skybox", "dfg", "irradiance")}

@@ -56,8 +56,8 @@ SUN_RADIUS = math.radians(0.2665)  # of the sun as seen from the earth
 SUN_RADIANCE = 4e5
 DFG_TOLERANCE = 5e-6
 SHEEN = 10
-"""How many times the tolerance Charlie's levels are allowed: a sheen reflects a tenth of what GGX does, and where its
-smooth lobes are a rim at the horizon, hard panels do not reach 1e-3 on any grid."""
+"""Factor on the tolerance that Charlie's levels are allowed: a sheen reflects a tenth of what GGX does, and where its
+smooth lobes are a rim at the horizon, no grid reaches 1e-3 under panels with sharp edges."""
 
 
 def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
@@ -882,6 +882,7 @@ class EntryKey:
 
     @staticmethod
     def of(choice: Chosen) -> EntryKey:
+        """Return the key of an NDF with its given parameters."""
         return EntryKey(id(choice.model), tuple(sorted(choice.given.items())), choice)
 
 

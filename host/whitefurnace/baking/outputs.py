@@ -525,7 +525,7 @@ WRITERS = {
     "sh": Writer(_sh_size, _sh_file),
     "dfg": Writer(_dfg_size, _dfg),
 }
-"""What an engine's file can hold, with what makes it."""
+"""The possible contents of an engine's file, each with the functions that make it."""
 
 
 # ---------------------------------------------------------------------------------------------- everything in one

@@ -15,7 +15,8 @@ from whitefurnace.prefiltering.plan import plan_chain
 from whitefurnace.prefiltering.recipe import Chain
 
 LEAST_TERMS = 16
-"""Of a table of Smith's area; how many there are is known when it is made, and is one line of the text."""
+"""Smallest number of terms of a table of Smith's area. The true number is known when the table is made, and is one line
+of the text."""
 
 
 @dataclass(frozen=True)

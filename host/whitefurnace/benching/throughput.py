@@ -35,10 +35,11 @@ from whitefurnace.sphere.environments import environment
 from whitefurnace.sphere.grids import Shape, latlong_tables
 
 RUNS = 7
-"""Number of runs of a case after one that does not count. The median is stated."""
+"""Number of timed runs of a case, after one that is not timed. The median is stated."""
 
 LEAST_SECONDS = 0.02
-"""Shortest run. Work grows until the device takes this long, a hundred times the start of a launch on a CPU."""
+"""Shortest run in seconds. The work grows until the device takes this long, a hundred times the start of a launch on a
+CPU."""
 
 GROUPS = 4096
 """Number of work groups of a yardstick: many for each core, so that none waits long for the last."""

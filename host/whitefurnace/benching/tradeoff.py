@@ -30,8 +30,8 @@ TOLERANCES = (1e-2, 3e-3, 1e-3, 1e-4, 2e-5)
 SAMPLES = (32, 128, 512, 2048, 16384)
 RUNS = 5
 BUDGET = 3.0
-"""Seconds of one point. Its runs after the first end when they have taken this long. Where the first run takes longer,
-it is the only one, with kernels that cheaper points have built."""
+"""Seconds of one point. No further run starts after this time. If the first run alone takes longer, it is the only one;
+cheaper points have built its kernels by then."""
 
 COST_TOLERANCE = QUALITIES["normal"]
 SIZES = (64, 128, 256, 512)

@@ -175,7 +175,8 @@ AREA_RULES = {
     32: (Rule("polar", 80, 120, 1), Rule("polar", 112, 168, 1)),
     64: (Rule("polar", 160, 240, 1), Rule("polar", 224, 320, 1)),
 }
-"""The rules of Smith's tabulated area by precision: the second makes the table, the first tells its error."""
+"""The rules of the table of Smith's area by precision: the second makes the table, the first gives its error estimate.
+"""
 
 AVERAGE_RULES = (12, 18, 26, 36, 52, 76)
 """Nodes in n·v of an average albedo, after μ = x², which resolves the grazing end."""

@@ -16,7 +16,7 @@ FORMS = {
 }
 
 CONSTANTS = ("per_norm", "lobe_width")
-"""What the engine finds out about a user's D; its own parameters cannot have these names."""
+"""Names of the numbers that the engine computes from a user's D; its own parameters cannot have these names."""
 
 _TAKEN = (*CONSTANTS, "area_scale", "area_per_range", "area_grazing", "area_terms")
 

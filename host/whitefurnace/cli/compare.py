@@ -31,6 +31,7 @@ Exit codes: 0 done, 1 usage, 2 cannot read or write, 3 invalid input, 5 not supp
 
 
 def axes(letter: str, default: str) -> options.Decorator:
+    """Return the option `--axes-a` or `--axes-b`, with `default` for its help."""
     return options.option(
         f"--axes-{letter.lower()}",
         metavar="AXES",

@@ -36,7 +36,7 @@ HINTS = {
     errno.EMFILE: "; more open files must be allowed (ulimit -n)",
     errno.ENFILE: "; other programs hold too many open files",
 }
-"""What to do about an error of the system, by its number."""
+"""The remedy for each error of the system, by its number."""
 
 
 # ---------------------------------------------------------------------------------------------- streams

@@ -113,14 +113,17 @@ def option(*names: str, heading: str, help: str, **attributes: Any) -> Decorator
 
 
 def output_folder(help: str, *, required: bool = False, heading: str = "Output") -> Decorator:
+    """Return the option `-o DIR`."""
     return option("-o", "--output", metavar="DIR", required=required, type=FilePath, heading=heading, help=help)
 
 
 def output_file(help: str) -> Decorator:
+    """Return the option `-o FILE`."""
     return option("-o", "--output", metavar="FILE", required=True, type=FilePath, heading="Output", help=help)
 
 
 def ndf(help: str, *, default: str | None = None, heading: str) -> Decorator:
+    """Return the option `--ndf`; `help` ends its text."""
     return option(
         "--ndf",
         metavar="NAME[:p=v,...]",
@@ -138,6 +141,7 @@ def fresnel_help(help: str) -> str:
 
 
 def light(help: str, *, multiple: bool = False, heading: str) -> Decorator:
+    """Return the option `--light`; `help` begins its text. multiple: it may be repeated."""
     return option(
         "--light",
         metavar="NAME[:p=v,...]",
@@ -148,10 +152,12 @@ def light(help: str, *, multiple: bool = False, heading: str) -> Decorator:
 
 
 def tolerance(help: str, *, heading: str = "Accuracy") -> Decorator:
+    """Return the option `--tolerance`."""
     return option("--tolerance", metavar="X", type=float, heading=heading, help=help)
 
 
 def rotate(heading: str) -> Decorator:
+    """Return the option `--rotate`, in degrees."""
     return option(
         "--rotate",
         metavar="DEG",
@@ -163,6 +169,7 @@ def rotate(heading: str) -> Decorator:
 
 
 def exposure(heading: str, what: str = "the radiance of the environment") -> Decorator:
+    """Return the option `--exposure`, in stops; `what` names what it multiplies."""
     return option(
         "--exposure",
         metavar="EV",
@@ -174,6 +181,7 @@ def exposure(heading: str, what: str = "the radiance of the environment") -> Dec
 
 
 def nonfinite(heading: str) -> Decorator:
+    """Return the option `--nonfinite`."""
     return option(
         "--nonfinite",
         metavar="refuse|zero",
@@ -185,6 +193,7 @@ def nonfinite(heading: str) -> Decorator:
 
 
 def certify(help: str, *, default: int | None = None) -> Decorator:
+    """Return the option `--certify`, a number of texels or pixels."""
     return option(
         "--certify",
         metavar="N",
@@ -197,10 +206,12 @@ def certify(help: str, *, default: int | None = None) -> Decorator:
 
 
 def as_read(help: str) -> Decorator:
+    """Return the flag `--as-read`."""
     return option("--as-read", is_flag=True, heading="Accuracy", help=help)
 
 
 def plot(what: str) -> Decorator:
+    """Return the option `--plot DIR`; `what` names what is drawn."""
     return option(
         "--plot",
         "folder",
@@ -212,6 +223,7 @@ def plot(what: str) -> Decorator:
 
 
 def device(heading: str = RUNNING) -> Decorator:
+    """Return the option `--device`."""
     return option(
         "--device",
         metavar="NAME",
@@ -222,6 +234,7 @@ def device(heading: str = RUNNING) -> Decorator:
 
 
 def memory(heading: str = RUNNING) -> Decorator:
+    """Return the option `--memory`."""
     return option(
         "--memory",
         metavar="SIZE",
@@ -246,16 +259,19 @@ def _set_memory(context: click.Context, parameter: click.Parameter, value: str |
 
 
 def dry_run(help: str = "Print what would be computed and written, and do nothing.") -> Decorator:
+    """Return the flag `--dry-run`."""
     return option("--dry-run", is_flag=True, heading=RUNNING, help=help)
 
 
 def force(
     help: str = "Make outputs again that are up to date, and overwrite files that this tool did not write.",
 ) -> Decorator:
+    """Return the flag `--force`."""
     return option("--force", is_flag=True, heading=RUNNING, help=help)
 
 
 def as_json() -> Decorator:
+    """Return the flag `--json`."""
     return option(
         "--json",
         "as_json",
@@ -277,4 +293,5 @@ def debug() -> Decorator:
 
 
 def quiet(help: str = "Print errors only.") -> Decorator:
+    """Return the flag `--quiet`."""
     return option("--quiet", is_flag=True, heading=RUNNING, help=help)

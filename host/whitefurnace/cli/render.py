@@ -247,6 +247,7 @@ def _refuse_options_of_the_truth(given: Mapping[str, Any]) -> None:
 
 
 def rendered_row(made: Rendered) -> dict[str, Any]:
+    """Return the JSON row of a picture of one engine."""
     row = {"event": "rendered", **vars(made), "path": str(made.path)}
     if not made.materials:
         del row["materials"]
@@ -254,6 +255,7 @@ def rendered_row(made: Rendered) -> dict[str, Any]:
 
 
 def rendered_text(made: Rendered) -> str:
+    """Return the text of a picture of one engine."""
     columns, rows = (" ".join(f"{x:.3g}" for x in values) for values in (made.roughness, made.metalness))
     of = [f"  across  roughness {columns}", f"  down    metalness {rows}"]
     if made.materials:
@@ -285,6 +287,7 @@ def _values(value: Any) -> str:
 
 
 def side_by_side_row(made: SideBySide) -> dict[str, Any]:
+    """Return the JSON row of a picture that is compared with the truth."""
     return {
         **rendered_row(made),
         "certificate": [vars(held) for held in made.certificate],
@@ -293,6 +296,7 @@ def side_by_side_row(made: SideBySide) -> dict[str, Any]:
 
 
 def side_by_side_text(made: SideBySide) -> str:
+    """Return the text of a picture that is compared with the truth."""
     seconds = ", ".join(f"{name} {value:.1f} s" for name, value in made.seconds.items())
     return "\n".join(
         [

@@ -40,7 +40,7 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "sh": (".txt", ".json"),
     "dfg": (".ktx2", ".dds", ".png", ".exr"),
 }
-"""What is written in which container. `.env` and `.gltf` hold the harmonics too."""
+"""The contents that each container can hold, by suffix. `.env` and `.gltf` hold the harmonics too."""
 
 FORMATS: dict[str, tuple[str, ...]] = {
     ".ktx": ("b10g11r11", "rgba16f", "rgba32f", "rgb9e5", "rg16f"),
@@ -84,6 +84,7 @@ class File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def suffix(self) -> str:
+        """Suffix of the file, in lower case."""
         return Path(self.name).suffix.lower()
 
     @property
@@ -244,7 +245,7 @@ def axes_matrix(text: str, where: str = "axes") -> tuple[tuple[int, int, int], .
 
 READ_IN_ITS_SOURCE = "read in the engine's source"
 READ_IN_COPIES = "from third-party copies of its shaders"
-"""Where the facts of presets are from, as `Engine.facts` says it."""
+"""Sources of the facts of presets, as `Engine.facts` states them."""
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,7 @@ class Texture:
 
     @property
     def cube(self) -> bool:
+        """True if the texture is a cube or an array of cubes."""
         return self.faces == 6
 
     def extent(self, k: int) -> tuple[int, int]:

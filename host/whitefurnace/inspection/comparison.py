@@ -36,7 +36,7 @@ ALIKE = 1.01
 """Largest ratio of the texel angles of two grids at which either may count as the coarser one."""
 
 MIRRORED = 0.2
-"""A cube is reported as turned or mirrored if one of the 48 symmetries leaves less than this share of the error."""
+"""A cube is reported as turned or mirrored if one of the 48 symmetries reduces the error to less than this share."""
 
 
 @dataclass(frozen=True)

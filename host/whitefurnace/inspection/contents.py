@@ -151,6 +151,7 @@ class Contents:
 
     @property
     def cube(self) -> bool:
+        """True if the file holds a cube or an array of cubes."""
         return self.kind in ("cube", "cube array")
 
 

@@ -15,8 +15,8 @@ from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.opencl.launch import evaluate
 
 QUANTILES = 4096
-"""Intervals of a tabulated quantile, between which the density is taken as constant in the graded angle: with 12
-e-folds of angle that is wrong by h²/12 ≈ 1e-6 of the density."""
+"""Intervals of a tabulated quantile function. The density is taken as constant within an interval, in the graded angle:
+with 12 e-folds of angle the error is h²/12 ≈ 1e-6 of the density."""
 
 
 def sample(

@@ -14,13 +14,14 @@ import numpy as np
 
 _ENDS = np.geomspace(1e-7, 0.03, 14)
 SAMPLES = np.concatenate([[0.0], _ENDS, np.linspace(0.06, 0.94, 17), 1 - _ENDS[::-1], [1.0]])
-"""Where in a piece, from 0 to 1, the nearest to n is looked for: also close to its ends, where it may set."""
+"""Places in a piece, from 0 to 1, at which the search for the place nearest to n begins: also close to its ends, where
+it may meet the horizon."""
 
 GOLDEN = 40
-"""Steps of golden section after that: they end at the root of float64's rounding."""
+"""Steps of golden section after that: they end at the square root of float64's rounding."""
 
 HORIZON = 1e-3
-"""The least scale at which a panel is graded where it meets the horizon."""
+"""Smallest scale at which a panel is graded where it meets the horizon."""
 
 
 @dataclass(frozen=True)

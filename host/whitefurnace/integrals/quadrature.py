@@ -30,19 +30,20 @@ BACKFACING = ("clamp", "absolute")
 ROUNDING = {32: 1e-6, 64: 2e-14}
 
 BLOCK = 64
-"""Neighbouring cells that climb the ladder together. One cell alone could meet two rules that err alike."""
+"""Number of neighbouring cells that get the same rules. A single cell could meet two rules that have the same error."""
 
 LUCK = 5
-"""What a rule is taken to gain on the one before at most; fewer cells than a block that agree at once are taken to be
-lucky too. Without both, one lone cell in ten states an error too small in float64, by up to 30 times; whole blocks pay
-next to nothing for it."""
+"""Assumed largest error reduction between neighbouring rules. It guards against accidental agreement, also of fewer
+cells than a block that agree at the first comparison. Without both, one single cell in ten states an error too small in
+float64, by up to 30 times; whole blocks lose next to nothing by it."""
 
 CLOSED_FROM = (1 / 512, 1e-8)
-"""The least n·v and tolerance of kernels with closed forms: nearer to grazing or finer the general ones are faster."""
+"""Smallest n·v and tolerance for kernels with closed forms: nearer to grazing, or for a finer tolerance, the general
+kernels are faster."""
 
 UNFINISHED = 3
-"""Times its last change that the end of the ladder may be off where it did not converge: an error of first order in the
-nodes, as kinks leave it, falls by 1.4 a rule, and 1/1.4 + 1/1.4² + … is 2.5."""
+"""Factor on the last change that bounds the error where the rules did not converge. An error of first order in the
+nodes, as kinks have it, falls by 1.4 per rule, and 1/1.4 + 1/1.4² + … is 2.5."""
 
 Progress = Callable[[float], None]
 

@@ -43,7 +43,7 @@ from whitefurnace.sphere.environments import Environment, environment
 from whitefurnace.sphere.grids import composite, cube_directions, cube_tables, latlong_tables
 
 CELLS_A_TIME = 4096
-"""Cells of an area light whose panels, some twenty each, are held together."""
+"""Number of cells of an area light whose panels, about twenty each, are in memory together."""
 
 LADDER = tuple(
     Rule("outline", *step)

@@ -17,14 +17,14 @@ from whitefurnace.opencl.device import Device
 from whitefurnace.opencl.launch import evaluate, over_nodes
 
 AREA_NODES = {32: 96, 64: 224}
-"""Chebyshev nodes of the table of Smith's area: 96 hold A to 3e-8, 224 to 1e-12 for every NDF of the catalogue over
-its domain but where its own rounding is more (tests/integrals/test_integrate.py)."""
+"""Chebyshev nodes of the table of Smith's area. 96 nodes give A to 3e-8, and 224 to 1e-12, for every NDF of the
+catalogue over its domain, except where its own rounding is larger (tests/integrals/test_integrate.py)."""
 
 AREA_KEPT = {32: 2e-8, 64: 2e-14}
-"""Coefficients at the end that add up to less are cut off."""
+"""Trailing Chebyshev coefficients whose sum is below this are dropped."""
 
 CONVERGED = 1e-3
-"""Where two fine rules differ by more, relatively, an integral is taken to be infinite: a logarithm in 1/cos θ grows
+"""Relative difference of two fine rules above which an integral is taken to be infinite: a logarithm in 1/cos θ grows
 by 5 % from one to the next."""
 
 

@@ -20,10 +20,11 @@ from whitefurnace.opencl import constants
 from whitefurnace.opencl.bindings import FUNCTIONS, VECTOR, bindings, is_isotropic, lanes
 
 LOBE_WIDTH = 0.05
-"""Where the rule of a user's BRDF grades its half vectors, in radians. Lobes ten times narrower are still met."""
+"""Width in radians for which the rule of a user's BRDF grades its half vectors. Lobes ten times narrower are still
+resolved."""
 
 LEAST_COSINE = 1e-9
-"""The least cosine at which a BRDF given as f(l, v) is evaluated. It stands for the limit at grazing, where some BRDFs
+"""Smallest cosine at which a BRDF given as f(l, v) is evaluated. It stands for the limit at grazing, where some BRDFs
 divide by the cosine."""
 
 OUTLINE = ("Cx", "Cy", "Cz", "Ax", "Ay", "Az", "Bx", "By", "Bz", "length", "scale")

@@ -32,11 +32,11 @@ SERIES = {32: 3e-7, 64: 3e-8}
 """Largest share of a lobe's energy that its series may misplace, by precision."""
 
 NEAR_TEXELS = 12.0
-"""Radius of the window of a lobe much narrower than a texel, in parts of texels. Texels within it are cut finely;
-beyond it, masses at corrected centres resolve the lobe."""
+"""Radius of the window of a lobe that is much narrower than a texel, in parts of texels. Texels within it are cut
+finely; beyond it, masses at corrected centres resolve the lobe."""
 
 MOST_TOGETHER = 4096
-"""Largest number of directions of exact integrals at a time. It bounds memory, and a launch to a second."""
+"""Largest number of directions of exact integrals at a time. It bounds the memory, and a launch to about a second."""
 
 HARMONICS_CHUNK = 1024
 EXACT_SHARE = 0.3  # of the progress: the certificate's sums come first and take about this part of the time

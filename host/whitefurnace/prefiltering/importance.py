@@ -33,11 +33,11 @@ SAMPLES_A_LAUNCH = 1 << 26
 """Number of samples of all outputs of one launch: about 0.2 s on two cores, so that Ctrl-C takes effect."""
 
 INTERVALS = 4096
-"""Number of intervals of the table of a lobe's energy. 12 e-folds of angle in as many steps leave 1e-6 of the density
-between them."""
+"""Number of intervals of the table of a lobe's energy. 12 e-folds of angle in as many steps have an error of 1e-6 of
+the density."""
 
 STEEPEST = 0.75 * math.log2(3)
-"""How many levels higher a sample is read at a cube's corner than at the middle of a face."""
+"""Number of levels by which a sample at a cube's corner is read higher than at the middle of a face."""
 
 GOLDEN = (math.sqrt(5) - 1) / 2
 
@@ -65,7 +65,7 @@ class Sampler:
         self.base, _ = channel_range(means.texels)
         rows = means.rows // 2 if means.latlong else means.rows
         self.size = min(1 << max(rows - 1, 0).bit_length(), LARGEST_SOURCE)
-        """Texels a face edge of the first level: a power of two, at least as fine as the environment's own."""
+        """Texels of a face edge of the first level: a power of two, at least as fine as the environment's own."""
         self._pyramids: dict[int, Buffer] = {}
 
     def _kernel(self, name: str, lanes: int) -> Kernel:

@@ -41,8 +41,8 @@ SHARPEST = 1.0
 reduce the error on a studio by another 5 % and need a source grid twice as fine."""
 
 FEWEST, MOST, TOGETHER = 3, 8, 32
-"""Values of r between two levels at which a read is scored, TOGETHER over all but no fewer and no more than these:
-midpoints in lod, each for the range of r it stands for."""
+"""Number of values of r between two levels at which a read is scored: TOGETHER over all levels, but no fewer than
+FEWEST and no more than MOST between two. They are midpoints in lod, each for the range of r around it."""
 
 LEAST = 0.05
 """A mixture is nowhere less than this share of the level's own lobe, so that light from no direction counts as
@@ -50,7 +50,7 @@ negative."""
 
 RIDGE = 1e-8
 """Weight of the pull towards the level's own lobe, relative to each node's own weight in the sums. Neighbouring nodes
-are nearly alike, and without the pull weights of ±10 would improve the fourth digit."""
+are nearly alike; without the pull, weights of ±10 would improve only the fourth digit."""
 
 ROUNDS = 5
 FLOOR = 1e-3  # of the mean, below which errors are not relative any more: the texel error's

@@ -41,30 +41,37 @@ class Prefiltered:
 
     @property
     def values(self) -> tuple[np.ndarray, ...]:
+        """The levels as arrays; see the class."""
         return tuple(level.texels for level in self.levels)
 
     @property
     def roughness(self) -> np.ndarray:
+        """Perceptual roughness of each level, (n,)."""
         return np.array([level.roughness for level in self.levels])
 
     @property
     def error(self) -> np.ndarray:
+        """Stated error of each level, (n,)."""
         return np.array([level.error for level in self.levels])
 
     @property
     def worst(self) -> np.ndarray:
+        """Largest texel error that was seen in each level, (n,)."""
         return np.array([level.worst for level in self.levels])
 
     @property
     def rmse(self) -> np.ndarray:
+        """Relative RMSE of each level, (n,)."""
         return np.array([level.rmse for level in self.levels])
 
     @property
     def evaluations(self) -> int:
+        """Number of lobe evaluations of all levels."""
         return sum(level.pairs for level in self.levels)
 
     @property
     def rule(self) -> tuple[str, ...]:
+        """Method of each level."""
         return tuple(level.method for level in self.levels)
 
 

@@ -39,10 +39,11 @@ def splits_for(groups: int, classes: int) -> int:
 
 
 SPREAD = 16
-"""Smallest number of work items where there are enough sources. With few outputs, cores would be idle otherwise."""
+"""Smallest number of work items where there are enough sources. Otherwise cores would be idle with few outputs."""
 
 NODES_A_BAND = 1 << 18
-"""Source nodes listed at a time in the exact sum: 8 MiB, which stay in cache while all lobes read them."""
+"""Number of source nodes that are listed at a time in the exact sum: 8 MiB, which stay in cache while all lobes read
+them."""
 
 # Nodes a face edge for a p99 error of 1e-3 on the hardest of the measured environments (studio, forest). The sharp
 # term follows the lobe's width. The floor follows the kink of (n·l)₊ at the horizon, which rough lobes have at full
@@ -132,7 +133,7 @@ FEWER_NODES = 0.7
 read at texels too."""
 
 TEXELS_A_LAUNCH = 1 << 20
-"""Texels that one launch reads from nodes, .05 s."""
+"""Number of texels that one launch reads from nodes, which takes .05 s."""
 
 
 def output_nodes(n: int, alpha: float) -> int:
@@ -262,8 +263,8 @@ def close_work(chord: float, n: int) -> float:
 
 
 FAR_NODES = 20.0
-"""Nodes × radians of a far grid beyond the angle where the near part ends, for a tolerance of 1e-3. Measured: it leaves
-the error as it is."""
+"""Nodes × radians of a far grid beyond the angle where the near part ends, for a tolerance of 1e-3. Measured: it does
+not change the error."""
 
 
 @lru_cache(maxsize=4096)

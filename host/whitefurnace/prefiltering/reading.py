@@ -27,8 +27,8 @@ from whitefurnace.sphere.environments import Environment, cube_solid_angles
 from whitefurnace.sphere.grids import Shape, cube_directions, face_coordinates, radiance_at
 
 DIRECTIONS = 256
-"""Number of random directions, the same for every environment. From one set of them to another the mean over r of a
-studio's error varies by 2 % (standard deviation of five), and the ratio of `--fit read` to own lobes by 1 %."""
+"""Number of random directions, the same for every environment. Between sets of them the mean over r of a studio's error
+varies by 2 % (standard deviation of five), and the ratio of `--fit read` to own lobes by 1 %."""
 
 SCORED = 24
 SMOOTHEST = 1 / 24
@@ -36,27 +36,27 @@ SMOOTHEST = 1 / 24
 texel of a 1K image and what is seen is the image; Filament clamps at .045."""
 
 REDUCED, COARSEST = 0.35, 128
-"""A lobe of α is integrated over texels (halved by exact means where the image has finer ones) of at most this × α, in
-no fewer rows than that. On a studio they leave 2.4e-3 RMS at most, far below the error of any read."""
+"""A lobe of α is integrated over texels of at most this × α, in no fewer rows than that; finer images are halved by
+exact means. On a studio this adds at most 2.4e-3 RMS, far below the error of any read."""
 
 TOLERANCE = 4e-2
-"""Tolerance of the quadrature where the image's own texels are coarser than that: r < .1, where reads have ten times
-this error."""
+"""Tolerance of the quadrature where the image's own texels are coarser than that: at r < .1, where the error of reads
+is ten times as large."""
 
 STEP = 0.1
 """Step in log r of the nodes at which lobes are integrated. Between them they are interpolated, within 3e-4 RMS."""
 
 PARTS = ("between", "texels", "levels", "format", "all")
-"""Parts of the error that a read adds to the exact lobe: `between` levels that are exact everywhere, linearly in lod;
-`texels`, bilinearly between texels; `levels`, the stated p99 errors of the levels that are read; `format`, the error of
-the pixel format; and `all`, the total error."""
+"""Parts of the error that a read adds to the exact lobe: `between` levels that are exact everywhere, linear in lod;
+`texels`, bilinear reads between texels; `levels`, the stated p99 errors of the levels that are read; `format`, the
+error of the pixel format; and `all`, the total error."""
 
 
 # ------------------------------------------------------------------------------------------------- formats
 
 
 FORMATS: Mapping[str, str] = {"float32": "rgba32f", "float16": "rgba16f", "r11g11b10": "b10g11r11", "rgb9e5": "rgb9e5"}
-"""Formats through which reads are measured, each with the pixel format of files that it is."""
+"""Formats through which reads are measured, each with the name of its pixel format in files."""
 
 
 def stored(values: np.ndarray, format: str) -> np.ndarray:

@@ -18,11 +18,11 @@ panel at the horizon shows most."""
 
 COARSE = {"sharp": 2.0, "rough": 2.2}
 """Factor by which a grid that replaces all texels in a level's reference is finer than the level's own grid. Its error
-is 2^6.5 = 90 times smaller where the lobe's width decides, 2.2² = 5 times smaller where its kink does."""
+is 2^6.5 = 90 times smaller where the lobe's width limits it, 2.2² = 5 times smaller where its kink does."""
 
 COARSE_GRID = 512
-"""Largest number of nodes per edge of such a grid. For sharper lobes texels are summed, only those near their direction
-if need be."""
+"""Largest number of nodes per edge of such a grid. For sharper lobes texels are summed, if necessary only those near
+their direction."""
 
 
 @dataclass

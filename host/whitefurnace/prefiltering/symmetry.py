@@ -21,7 +21,7 @@ PIECE = 1 << 16
 """Number of classes whose images are in memory together: 38 MiB in float32."""
 
 MOST_PLACES = 512
-"""Nodes an edge of the finest grid whose places are kept, in 38 MiB."""
+"""Nodes per edge of the finest grid whose places are kept, in 38 MiB."""
 
 
 @dataclass(frozen=True)

@@ -298,7 +298,7 @@ SHADINGS: Mapping[str, Callable[..., Weights]] = {
     "fdez_aguera": _fdez_aguera,
     "khronos": _khronos,
 }
-"""By `Engine.shading`, a function from (A, B, base colour, metalness, r, NoV, F0 of insulators) to the weights of
+"""For each `Engine.shading`, a function from (A, B, base colour, metalness, r, NoV, F0 of insulators) to the weights of
 radiance and of E/π."""
 
 

@@ -35,14 +35,14 @@ TOLERANCE = 1e-2
 TOLERANCE_RANGE = (1e-4, 0.5)
 
 IRRADIANCE = 128
-"""Texels a face edge of the cube of E/π from which a Lambertian surface is read. Bilinear reads err by 2e-5 of its
+"""Texels of a face edge of the cube of E/π from which a Lambertian surface is read. Bilinear reads err by 2e-5 of its
 range."""
 
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Weights of linear Rec.709 in luminance."""
 
 DARK = 1e-3
-"""Floor of the truth's luminance that differences are divided by, over the mean radiance."""
+"""Smallest luminance of the truth by which differences are divided, relative to the mean radiance."""
 
 MOST = 0.95
 """Share of the spheres' pixels that the scale of differences covers."""

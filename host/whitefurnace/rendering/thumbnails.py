@@ -30,7 +30,7 @@ FINE = 2 * CELL
 four."""
 
 FACE = 32
-"""Texels a face edge from which thumbnails are drawn. The middle of a sphere of CELL pixels shows 25 of them."""
+"""Texels of a face edge from which thumbnails are drawn. The middle of a sphere of CELL pixels shows 25 of them."""
 
 MOST_SPHERES = 12
 LOOK = 1

@@ -39,33 +39,34 @@ from whitefurnace.sphere.grids import (
 from whitefurnace.sphere.suns import without_sun
 
 VISIBLE = ("ggx",)
-"""NDFs that are ellipsoids stretched by their width. The normals that v sees of them have a closed form."""
+"""NDFs that are ellipsoids stretched by their width. The distribution of their normals that v sees has a closed form.
+"""
 
 LIGHTS = 16384
 """Largest number of bright lights of an environment: 0.2 s of two cores for a sphere of 128 pixels."""
 
 FINEST = 0.0035
-"""Angle in radians within which texels become one light, where an image has more bright texels than LIGHTS."""
+"""Angle in radians within which texels are merged to one light, where an image has more bright texels than LIGHTS."""
 
 BLOCK = 0.125
-"""The same angle for wider lobes, over the lobe's width. Its error is of the second order, 1e-3 of the light's share.
-"""
+"""The same angle for wider lobes, relative to the lobe's width. Its error is of second order, 1e-3 of the light's
+share."""
 
 NEAR = 0.5
-"""Largest texel over the lobe's width. Larger texels are cut, into at most MOST_CUT parts together."""
+"""Largest texel relative to the lobe's width. Larger texels are cut, into at most MOST_CUT parts together."""
 
 MOST_CUT = 8 * LIGHTS
 
 SHARPER = 0.2
-"""Largest texels that a lobe is read from, over its width, so that bilinear reads do not blur the result."""
+"""Largest texel from which a lobe is read, relative to its width, so that bilinear reads do not blur the result."""
 
 QUADRATURE = 1e-4
-"""Tolerance of the exact values, over the mean radiance."""
+"""Tolerance of the exact values, relative to the mean radiance."""
 
 MOST_SAMPLES, FIRST_SAMPLES = 1 << 16, 256
 
 TRIED = 192
-"""Number of points at which the samples that a tolerance needs are found."""
+"""Number of points at which the number of samples for a tolerance is determined."""
 
 
 @dataclass(frozen=True)
@@ -244,7 +245,7 @@ class Truth:
                 break
             bright *= 2
         self.bright = bright
-        """Times the mean from which a texel's light is summed apart."""
+        """Radiance, in multiples of the mean, from which a texel's light is summed apart."""
         self.rest = self._sampler(rest)
         self._whole: Sampler | None = None
 

@@ -56,6 +56,7 @@ class SphereLayout:
 
     @property
     def rows(self) -> int:
+        """Number of rows."""
         return -(-len(self.spheres) // self.columns)
 
     def placed(self) -> tuple[dict[str, object], ...]:

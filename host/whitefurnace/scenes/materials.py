@@ -19,11 +19,11 @@ from whitefurnace.errors import InputError, UnsupportedError, nearest
 from whitefurnace.files import Gltf, srgb_table
 
 MAX_NODES, MAX_MATERIALS, MAX_MESHES = 1 << 18, 1 << 14, 1 << 18
-"""More is no scene that somebody made: a node is read in 65 µs, a material in 1.5 ms."""
+"""Largest numbers that a scene may have. A real scene has fewer; a node is read in 65 µs, a material in 1.5 ms."""
 
 MAX_PRIMITIVES = 1 << 20
 MAX_INDICES = 1 << 26
-"""Of triangles whose texture coordinates are looked at, all in all; then whole images count."""
+"""Largest total number of triangle indices whose texture coordinates are examined; beyond it whole images count."""
 
 BINS = 64
 """Number of bins of a histogram, equal parts of [0, 1]."""

@@ -18,7 +18,7 @@ from whitefurnace.scenes.materials import Material, Scene
 from whitefurnace.scenes.scale import MEDIA, Judgement, Medium, Triple, footprint, judge, length, length_text, medium
 
 TABLE = 64
-"""Texels a side of a table of diffusion. Along n·l they are as far apart as those of an 8-bit diffuse ramp of 64."""
+"""Texels on a side of a table of diffusion. Along n·l they are as far apart as those of an 8-bit diffuse ramp of 64."""
 
 ROWS = 16384
 """Largest height of an image that --resolution takes."""

@@ -326,6 +326,7 @@ class Judgement:
 
     @property
     def sentences(self) -> tuple[str, ...]:
+        """The reasons of absorption and transport, as sentences."""
         return tuple(part.reason for part in (self.absorption, self.transport) if part)
 
     def data(self) -> dict[str, Any]:

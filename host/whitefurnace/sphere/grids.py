@@ -203,8 +203,8 @@ def radiance_at(env: Environment, d: np.ndarray) -> np.ndarray:
 
 
 POINTS = ((610, 377), (10946, 6765))
-"""Points of a texel and of its reference: Fibonacci lattices, whose error where an edge of light crosses the texel
-falls as N^-¾ however it lies."""
+"""Numbers of points of a texel and of its reference: Fibonacci lattices, whose error where an edge of light crosses the
+texel falls as N^-¾ for every position of the edge."""
 
 
 def octahedral_means(env: Environment, shape: Shape, index: np.ndarray, lattice: tuple[int, int]) -> np.ndarray:

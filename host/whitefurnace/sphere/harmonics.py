@@ -19,13 +19,13 @@ BANDS = np.array([0, 1, 1, 1, 2, 2, 2, 2, 2])
 """Degree l of each coefficient."""
 
 COSINE = np.array([1, 2 / 3, 1 / 4])[BANDS]
-"""Â_l/π, what the clamped cosine leaves of degree l of the radiance in E/π. [Ramamoorthi2001, eq. 8]"""
+"""Â_l/π, the factor by which the clamped cosine multiplies degree l of the radiance in E/π. [Ramamoorthi2001, eq. 8]"""
 
 # Factors of 1, y, z, x, xy, yz, 3z² - 1, xz, x² - y² in the basis. [Ramamoorthi2001, eq. 3]
 FACTORS = np.sqrt(np.array([1, 3, 3, 3, 15, 15, 5 / 4, 15, 15 / 4]) / (4 * math.pi))
 
 CONDON_SHORTLEY = np.array([1, -1, 1, -1, 1, -1, 1, -1, 1])
-"""(-1)^m: from our basis to the one of those who keep the Condon-Shortley sign (Filament's cmgen --sh, Babylon.js)."""
+"""(-1)^m: converts from our basis to the one with the Condon-Shortley sign (Filament's cmgen --sh, Babylon.js)."""
 
 CUTOFFS = (1.0, 1024.0)
 """Domain of a window's cutoff, in bands."""
@@ -376,7 +376,7 @@ SCALINGS: dict[str, Callable[[Any], np.ndarray]] = {
     "filament": filament,
     "babylon": babylon,
 }
-"""By the name a preset gives; each takes radiance coefficients (..., 9, 3), in the engine's own axes."""
+"""Functions by the name that a preset gives; each takes radiance coefficients (..., 9, 3), in the engine's own axes."""
 
 
 def unscaled(values: np.ndarray, scaling: str) -> np.ndarray:

@@ -9,13 +9,13 @@ import numpy as np
 from whitefurnace.sphere.grids import Shape, bounds
 
 TEXELS = 64
-"""Texels of one bound: a tile of 8 × 8."""
+"""Number of texels that share one bound: a tile of 8 × 8."""
 
 CORNERS = [0, 19, 44, 63]
-"""Those at the corners of a tile, in the order of `Shape.tiled`."""
+"""Indices of the corners of a tile, in the order of `Shape.tiled`."""
 
 PART = 1 << 18
-"""Texels whose directions are in memory together."""
+"""Number of texels whose directions are in memory together."""
 
 
 def nearest_texels(shape: Shape, targets: np.ndarray, count: int) -> np.ndarray:

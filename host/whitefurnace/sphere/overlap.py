@@ -22,17 +22,17 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 BATCH = 64
-"""Output texels worked on together: what NumPy needs to be busy, and little memory."""
+"""Number of output texels that are computed together: enough for NumPy to be efficient, and little memory."""
 
 TALL = 24
-"""Source rows in a texel from which on prefix sums of its own columns pay."""
+"""Number of source rows in a texel from which prefix sums of its own columns are faster."""
 
 BLOCK = 1 << 18
-"""Source texels of one such prefix sum: 6 MiB."""
+"""Number of source texels of one such prefix sum: 6 MiB."""
 
 ALIGNED = 256
-"""Source texels along an edge of an output texel up to which faces that are not turned are laid on each other piece by
-piece."""
+"""Largest number of source texels along an edge of an output texel for which the overlaps of two cubes with the same
+axes are computed one by one."""
 
 
 def mean_over_texels(

@@ -19,20 +19,20 @@ from whitefurnace.sphere.grids import source_directions, source_solid_angles
 MODES = ("keep", "extract", "clamp=X")
 
 CAP, RING = math.radians(10.0), math.radians(15.0)
-"""The sun is looked for within CAP of the brightest texel, its sky between there and RING: a glare is narrower, and a
-sky hardly changes over so little."""
+"""Angles around the brightest texel: the sun is searched within CAP of it, and its sky between CAP and RING. A glare is
+narrower than CAP, and a sky hardly changes up to RING."""
 
 STANDS_OUT = 10.0
-"""Times the sky around it that the brightest texel must have to be a sun."""
+"""Smallest ratio of the brightest texel to the sky around it for a sun."""
 
 WIDER = 0.1
-"""Part of its energy that what stands out may have between CAP and RING: glints, but no panel."""
+"""Largest share of the extracted energy that may lie between CAP and RING: enough for glints, not for a light panel."""
 
 LEAST = 0.005
-"""Part of the energy of the source that a sun has at least: a highlight on a lamp's rim is none."""
+"""Smallest share of the source's energy for a sun: a highlight on the rim of a lamp has less."""
 
 BESIDE = 2.5
-"""Texels around the sun whose mean fills its hole."""
+"""Number of texels around the sun whose mean fills its hole."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from whitefurnace.errors import UsageError, nearest
 from whitefurnace.integrals.quadrature import rows_of_roughness
 
 SIZES = (1, 16384)
-"""The least and the largest number of values of an axis."""
+"""Smallest and largest number of values of an axis."""
 
 SCALES = ("linear", "log", "centres", "sqrt", "f0", "angle")
 
@@ -101,11 +101,12 @@ class Points:
     given: np.ndarray
 
     def values(self) -> np.ndarray:
+        """The values, float64."""
         return self.given
 
 
 AxisSpec = str | Sequence[Any] | Axis
-"""An axis as it is given: "A:B:N" or "A:B:N:SCALE", a tuple of the same, the scale of a default axis alone, or an
+"""An axis as a caller gives it: "A:B:N" or "A:B:N:SCALE", a tuple of the same, the scale of a default axis alone, or an
 `Axis`."""
 
 Ends = tuple[float, float, int, str]

@@ -15,8 +15,8 @@ ROUNDS = 4
 Four rounds bring the largest error of a 64² split-sum table from 4.4e-3 to 3.7e-3; more raise the 99th percentile."""
 
 LEAST = 0.045
-"""Least roughness that engines shade with [Lagarde2014]. At r = n·v = 0 the split-sum pair has no limit, so no table of
-texels can hold it. Rows below this roughness weigh little in a fit, and their errors are stated separately."""
+"""Smallest roughness that engines shade with [Lagarde2014]. At r = n·v = 0 the split-sum pair has no limit, so no table
+of texels can hold it. Rows below this roughness have little weight in a fit, and their errors are stated separately."""
 
 FAINT = 1e-2
 """Weight of the rows below `LEAST`."""

@@ -27,7 +27,7 @@ TERMS = 6
 """Coefficients of a polynomial in the roughness. GGX needs one of them (k = α/2), other NDFs all."""
 
 DEGREES = range(1, 11)
-"""Total degrees of a norm's polynomial. The least that meets the tolerance is taken."""
+"""Total degrees of a norm's polynomial. The lowest that meets the tolerance is used."""
 
 POWERS = (2, 4, 8, 16, 32, 64)
 """Powers p of the sums Σ|error|^p that are minimized one after the other. The p-th root of the last is within 3 % of
@@ -54,6 +54,7 @@ class Span:
 
     @classmethod
     def of(cls, name: str, values: np.ndarray) -> Span:
+        """Return the span of values of a variable, logarithmic where they span decades."""
         low, high = float(values.min()), float(values.max())
         return cls(name, low, high, low > 0 and high > 20 * low)
 

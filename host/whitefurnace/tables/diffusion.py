@@ -35,13 +35,13 @@ DOMAINS = {
 }
 
 NODES = (14, 20)
-"""Gauss nodes of a panel: of the rule for the error estimate, and of the rule whose values are kept."""
+"""Gauss nodes of a panel: those of the error estimate, and those of the rule whose values are kept."""
 
 LEFT = {32: 3e-8, 64: 1e-14}
 """Rounding error by precision: that of the format in float32, that of the sums in float64."""
 
 FLAT = 1e-13
-"""Width of the profile on a circle of radius 1 below which the body counts as flat; D then differs by as much."""
+"""Width of the profile on a circle of radius 1 below which the body counts as flat; this changes D by as much."""
 
 ROWS, COLUMNS = 64, 1024
 """Curvatures and cosines that are computed at once, in some ten MB."""

@@ -32,11 +32,11 @@ F0 = (0.04, 0.5, 0.9, 1.0)
 HALVINGS = 30
 SETTLED = 1e-14
 AT_ONCE = 1024
-"""Of the average of a Fresnel term: the most halvings of a panel, the change that ends them, and the number of cells
-that are computed at once."""
+"""For the average of a Fresnel term: the largest number of halvings of a panel, the change that ends them, and the
+number of cells that are computed at once."""
 
 CHECK = 96
-"""Nodes of the average that checks the furnace, in another variable than that of the table."""
+"""Number of nodes of the average that checks the furnace, in another variable than that of the table."""
 
 
 def _without_view(columns: Mapping[str, Any]) -> dict[str, Any]:

@@ -27,7 +27,7 @@ TOLERANCE = 1e-5
 """Default tolerance of float32 tables. Finer tolerances are computed in float64."""
 
 LOST = 4e-6
-"""Rounding error of R and T in float32 at grazing angles over narrow lobes: 3.5e-6 at most over the NDFs of the
+"""Largest rounding error of R and T in float32 at grazing angles over narrow lobes: 3.5e-6 over the NDFs of the
 catalogue (tests/tables/test_glass.py)."""
 
 
@@ -41,6 +41,7 @@ class Boundary(Part):
 
     @property
     def ladder(self) -> tuple[Rule, ...]:
+        """The rules of a boundary, from the coarsest to the finest."""
         return LADDERS["refraction"]
 
     def cells(self, rows: np.ndarray, precision: int, tolerance: float = 0.0) -> tuple[np.ndarray, int, float]:

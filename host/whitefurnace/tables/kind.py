@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from whitefurnace.tables.request import TableRequest
 
 Facts = dict[str, Any]
-"""What a manifest states of a table beside its error, by key: `channels`, `formula` and a kind's own."""
+"""Statements of a manifest about a table in addition to its error, by key: `channels`, `formula` and a kind's own."""
 
 
 class Kind:
@@ -31,7 +31,7 @@ class Kind:
     """
 
     name: str
-    """What the command line and the manifest call it."""
+    """Name of the kind on the command line and in the manifest."""
 
     summary: str
     """One line for help: what the table holds."""
@@ -55,22 +55,22 @@ class Kind:
     """The default NDF."""
 
     fresnel: str = "one"
-    """The Fresnel model that the table is of."""
+    """The default Fresnel model of the table."""
 
     usual_axes: Mapping[str, Ends] = {}
-    """Axes that the table has beside the default ones, by name."""
+    """Axes that the table has in addition to the default ones, by name."""
 
     on_device: bool = True
-    """Whether an OpenCL device computes it; numpy does otherwise."""
+    """True if an OpenCL device computes it, False if numpy does."""
 
     refittable: bool = True
-    """Whether texels may be fitted for reads between them (`--fit`), and what such reads cost may be measured."""
+    """True if texels may be fitted for reads between them (`--fit`), and the error of such reads may be measured."""
 
     coefficients: bool = False
-    """Whether the array holds coefficients of a curve in place of texels. These are written as .npy or .h alone."""
+    """True if the array holds coefficients of a curve instead of texels. These are written as .npy or .h alone."""
 
     if_too_many_channels: str = ""
-    """What to do where a file cannot hold the channels, after "give .npy"."""
+    """The remedy where a file cannot hold the channels, after "give .npy"."""
 
     # ------------------------------------------------------------------------------------------ checking a request
 

@@ -37,25 +37,26 @@ from whitefurnace.opencl.launch import evaluate, over_cells
 from whitefurnace.results import Integrated
 
 STAGES = ((Rule("gauss", 16, 32, 12), 0.3, 12), (Rule("gauss", 40, 64, 26), 0.02, 20))
-"""Rules of half vectors, how far the corner of |f̂ - p| is rounded off, and steps at most. The first finds the basin
-in a tenth of the work; what the second takes for m is within 5e-4 of the statement at the 99th percentile, 9e-3 at
-most."""
+"""For each stage: the rule of half vectors, the rounding of the corner of |f̂ - p|, and the largest number of steps.
+The first stage finds the basin in a tenth of the work. The m of the second is within 5e-4 of the stated m at the 99th
+percentile, 9e-3 at most."""
 
 EXACT = 96, 64
-"""Nodes in u.z and in half a turn of the statement: within 7e-5 of 640 × 300 at the 99th percentile of GGX's 64² table,
-2e-3 at most, 1.4e-2 at n·v = 0."""
+"""Nodes of the stated m in u.z and in half a turn: within 7e-5 of 640 × 300 nodes at the 99th percentile of GGX's 64²
+table, 2e-3 at most, 1.4e-2 at n·v = 0."""
 
 WITHIN = 1e-5
-"""A step that gains less than this of m ends a cell."""
+"""A step that reduces m by less than this ends a cell."""
 
 STEP = 0.5
-"""The largest entry of a step: δ is relative, and det (1 + δ) stays positive."""
+"""Largest entry of a step: δ is relative, and det (1 + δ) stays positive."""
 
 ROUNDS = 16
-"""Rounds in which cells that got stuck start again from their neighbours: a valley of n·v = 0 is 12 cells long."""
+"""Number of rounds in which cells without progress start again from their neighbours: a valley of n·v = 0 is 12 cells
+long."""
 
 ADOPTED = 0.98
-"""Of its own m, what a neighbour's start must come to."""
+"""Largest ratio of a neighbour's m to the cell's own m for the cell to start again from the neighbour."""
 
 
 @dataclass(frozen=True)
@@ -71,10 +72,12 @@ class Lobes:
 
     @property
     def count(self) -> int:
+        """Number of cells."""
         return self.rows.shape[1]
 
     @property
     def NoV(self) -> np.ndarray:
+        """Cosines of the views, (n,)."""
         return self.rows[0]
 
     def _cells(self, N: np.ndarray, which: np.ndarray) -> np.ndarray:

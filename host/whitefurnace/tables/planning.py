@@ -32,7 +32,7 @@ FORMS = (".npy", ".exr", ".png", ".ktx2", ".dds", ".h")
 FITS = ("bilinear",)
 
 FITTED = (2, 512)
-"""The least and the largest number of texels along an axis for which reads between them are measured."""
+"""Smallest and largest number of texels along an axis for which reads between them are measured."""
 
 CHANNELS = {1: ("Y",), 2: ("R", "G"), 3: ("R", "G", "B"), 4: ("R", "G", "B", "A")}
 """Names of the channels in EXR, by their number."""
@@ -88,6 +88,7 @@ class TablePlan:
 
     @property
     def manifest_path(self) -> Path:
+        """Path of the manifest: that of the file with .json appended."""
         return self.path.with_name(self.path.name + ".json")
 
     def canonical(self) -> dict[str, Any]:

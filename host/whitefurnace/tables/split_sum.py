@@ -19,7 +19,8 @@ TOLERANCE = 5e-6
 """Tolerance of the pairs of a bake; half floats have steps of 2.4e-4."""
 
 CHARLIE = 1e-4
-"""Least tolerance of Charlie's albedo: its error as half is 2e-4, of values up to 10 near grazing."""
+"""Smallest tolerance of Charlie's albedo: its error as half floats is 2e-4, since its values are up to 10 near grazing.
+"""
 
 CHANNELS: Mapping[str, tuple[tuple[str, str], str]] = {
     "scale_bias": (("scale", "bias"), "E(v; F0) = F0 scale + bias"),

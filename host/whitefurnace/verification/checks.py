@@ -28,25 +28,25 @@ from whitefurnace.opencl.source import LEAST_COSINE
 PRECISIONS = (32, 64)
 ROUNDING = {32: 2.0**-24, 64: 2.0**-53}
 RELATIVE = {32: 8 * 2.0**-24, 64: 1e-13}
-"""What a kernel may be off by besides what its arguments' rounding does: a few roundings. In float64 the references'
-own quadratures leave more, 1e-14."""
+"""Largest relative error of a kernel in addition to the effect of its arguments' rounding: a few roundings. In float64
+the references' own quadratures have more, 1e-14."""
 SMALLEST = {32: 1e-32, 64: 1e-300}
 """Below this, relative to the peak, kernels may round D to 0: exp does at 1e-38 (special.clh), and 1/cos⁴θ, 1e6 at most
 where it is not held, may come after it."""
 
 RULE = {32: 1e-6, 64: 1e-12}
-"""The tolerances asked of direct quadrature."""
+"""Tolerances for direct quadrature."""
 
 INTEGRAL = {32: 1.25e-6, 64: 1.02e-12}
-"""What a value of 1 by direct quadrature is held to: 1e-6 and 1e-12, and a rounding or two of the value itself."""
+"""Largest error of a value of 1 by direct quadrature: 1e-6 and 1e-12, and a rounding or two of the value itself."""
 
 ENERGY = 1e-6
-"""What an albedo may exceed its bound by, in both precisions: the rule is asked for no more."""
+"""Largest amount by which an albedo may exceed its bound, in both precisions: the tolerance of the rule."""
 
 FINITE = float(np.finfo(np.float32).max)
 
 FAMILY = 1e-4
-"""The chance that a right sampler fails any of its χ² tests: a level for all of them together."""
+"""Probability that a correct sampler fails any of its χ² tests: one level for all tests together."""
 
 # n·v from grazing to normal, the ends thicker.
 NOV = np.array([0.0, 1e-4, 1e-3, 1 / 64, 0.1, 0.3, 0.6, 0.9, 0.999, 1.0])
@@ -934,8 +934,8 @@ def _kernel_light(b: Bench) -> Iterator[Row]:
 
 
 HEMISPHERE = (512, 1024)
-"""Cells of sin²θ and φ for the irradiance of a light's reference: an edge crosses 3e-3 of them and errs by as many
-of their halves at random, 1e-5 together."""
+"""Numbers of cells of sin²θ and φ for the reference of a light's irradiance. An edge crosses 3e-3 of them with a random
+error of half a cell each, 1e-5 together."""
 
 
 def _irradiance(b: Bench, own: Mapping[str, float]) -> float:
