@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from whitefurnace.catalogue.numerics import held
 from whitefurnace.errors import UsageError
 
 
@@ -34,11 +35,11 @@ class Parameter:
     def check(self, values: Any, where: str) -> np.ndarray:
         """Return `values` as float64.
 
-        where: begins the error message. Raises UsageError for a value that is not a number, is not finite or lies
-        outside [low, high].
+        where: begins the error message. A value outside [low, high] by a rounding is taken as the end (`held`). Raises
+        UsageError for a value that is not a number, is not finite or lies further outside.
         """
         try:
-            array = np.asarray(values, np.float64)
+            array = np.asarray(held(values, self.low, self.high))
         except (TypeError, ValueError):
             raise UsageError(f"{where}: {self.name} must be a number, not {values!r}") from None
         bad = ~((array >= self.low) & (array <= self.high))  # also catches NaN

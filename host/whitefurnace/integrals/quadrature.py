@@ -13,6 +13,7 @@ import numpy as np
 
 from whitefurnace.catalogue import Integral, Model, integral, model
 from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
+from whitefurnace.catalogue.numerics import held
 from whitefurnace.catalogue.registry import CLOSED
 from whitefurnace.catalogue.rule import AVERAGE_RULES, LADDERS, Rule, gauss
 from whitefurnace.errors import CheckError, UnsupportedError, UsageError, nearest
@@ -346,8 +347,9 @@ def _finite_array(name: str, given: Any) -> np.ndarray:
 
 
 def _view(given: Any, backfacing: str | None) -> np.ndarray:
-    """n·v in [0, 1], views from behind dealt with as asked."""
-    NoV = _finite_array("NoV", given)
+    """n·v in [0, 1], views from behind dealt with as asked; the rounding of a dot product is forgiven."""
+    _finite_array("NoV", given)
+    NoV = np.asarray(held(held(given, 0.0, 1.0), -1.0, 1.0) if backfacing is None else held(given, -1.0, 1.0))
     if backfacing is not None and backfacing not in BACKFACING:
         raise UsageError(f"unknown backfacing {backfacing!r}{nearest(backfacing, BACKFACING)}")
     if backfacing == "clamp":

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue.choice import Chosen
+from whitefurnace.catalogue.numerics import held
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.integrals.quadrature import rows_of_roughness
 
@@ -125,7 +126,7 @@ def axis(name: str, given: AxisSpec) -> Axis:
     if len(parts) not in (3, 4):
         raise UsageError(form)
     try:
-        low, high, count = float(parts[0]), float(parts[1]), int(parts[2])
+        low, high, count = _end(name, parts[0]), _end(name, parts[1]), int(parts[2])
     except (TypeError, ValueError):
         raise UsageError(form) from None
     scale = parts[3] if len(parts) == 4 else "linear"
@@ -135,9 +136,20 @@ def axis(name: str, given: AxisSpec) -> Axis:
         raise UsageError(f"axis {name}: its ends must be finite")
     if scale in ("log", "f0") and not (low > 0 and high > 0):
         raise UsageError(f"axis {name}: {_article(scale)} scale needs ends above 0, not {low:g} and {high:g}")
+    if scale == "angle":
+        low, high = (float(held(end, -1.0, 1.0)) for end in (low, high))
     if scale == "angle" and not (abs(low) <= 1 and abs(high) <= 1):
         raise UsageError(f"axis {name}: an angle scale is of cosines, from -1 to 1, not {low:g} and {high:g}")
     return Axis(name, low, high, _count(count, f"axis {name}: "), scale)
+
+
+COSINES = {"NoV": (0.0, 1.0), "NoL": (-1.0, 1.0)}
+"""Cosines among the parameters that are no model's own, with their domains."""
+
+
+def _end(name: str, value: Any) -> float:
+    """Return a number of the parameter `name`; what leaves the domain of a cosine by a rounding is its end."""
+    return float(held(value, *COSINES[name])) if name in COSINES and not isinstance(value, str) else float(value)
 
 
 def _article(scale: str) -> str:
@@ -204,7 +216,7 @@ def named_axes(option: str, given: Sequence[str]) -> dict[str, str]:
 def number(name: str, value: Any) -> float:
     """Return the value of a fixed parameter as a finite number. Raises UsageError."""
     try:
-        found = float(value)
+        found = _end(name, value)
     except (TypeError, ValueError):
         hint = (
             f"; give a range as an axis, {name}={value}"

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import integral
+from whitefurnace.catalogue.numerics import held
 from whitefurnace.catalogue.rule import gauss
 from whitefurnace.catalogue.subsurface import Burley, Dipole, Gaussians, Profile, shape, skin
 from whitefurnace.errors import UsageError, nearest
@@ -65,6 +66,7 @@ def profile(scheme: str | None, given: Mapping[str, float]) -> Profile:
         f"{name}{suffix}" for group in groups for name in group for suffix in ("", *(f"_{c}" for c in CHANNELS))
     } | {"g", "ior"}
     _only(names, given, scheme)
+    given = {name: float(held(value, *DOMAINS[name.rsplit("_", 1)[0]])) for name, value in given.items()}
     for name, value in given.items():
         low, high = DOMAINS[name.rsplit("_", 1)[0]]
         if not low <= value <= high:
@@ -117,7 +119,7 @@ def _parts(scheme: str | None, columns: Mapping[str, np.ndarray]) -> tuple[np.nd
         if column.ndim:
             raise UsageError(f"diffusion has the axes NoL and curvature; give {name} as one number")
     found = profile(scheme, {name: float(column) for name, column in others.items()})
-    NoL, curvature = columns["NoL"], columns["curvature"]
+    NoL, curvature = held(columns["NoL"], -1.0, 1.0), columns["curvature"]
     if not (np.abs(NoL) <= 1).all():
         raise UsageError(f"NoL {float(NoL.flat[np.argmax(np.abs(NoL))]):g} is outside [-1, 1]")
     if not ((curvature >= 0) & (curvature <= 1e9)).all():
