@@ -12,7 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 from PIL import Image as Pillow
-from PIL import ImageCms, ImageOps
+from PIL import ImageCms, ImageOps, TiffImagePlugin
 
 from whitefurnace.errors import InputError
 from whitefurnace.files import image_facts, read_image
@@ -673,7 +673,7 @@ def test_tiff_states_its_curve_and_primaries(tmp_path, order):
     path = tiff(tmp_path / "d.tif", [page(floats, 2, form=3, t319=(5, rationals))], order)
     image = read_image(path)
     np.testing.assert_allclose(image.pixels[0, 0], REC2020_TO_709 @ [0.25, 0.5, 0.75], atol=2e-4)
-    assert "PrimaryChromaticities" in image.notices[0]
+    assert "primaries 0.708" in image.notices[0]
     icc = matrix_profile([curv()])
     path = tiff(tmp_path / "e.tif", [page(codes, 2, t301=(3, cube), t34675=(7, list(icc)))], order)
     np.testing.assert_allclose(read_image(path).pixels[0, 0], np.array([64, 128, 192]) / 255, atol=1e-6)
@@ -736,6 +736,7 @@ def test_tiff_alpha(tmp_path):
         ([page(RGB8.astype(np.int8), 2, form=2)], ("int8",)),
         ([page(RGB8.astype(np.uint32), 2)], ("uint",)),
         ([page(np.zeros((4, 8, 9), np.uint8), 2, bits=24, form=3, t277=(3, [3]), t258=(3, [24] * 3))], ("24 bits",)),
+        ([page(RGB8[..., :1], 3, t320=(3, [256] * 768))], ("palette", "16 bits")),
         ([page(RGB8[..., :1], 1, t291=(3, list(range(256))))], ("GrayResponseCurve",)),
         ([page(RGB8, 2, t532=(5, [(16, 1), (235, 1)] * 3))], ("ReferenceBlackWhite",)),
         ([page(RGB8, 2, t301=(3, [0, 1, 2]))], ("TransferFunction of 3",)),
@@ -767,6 +768,15 @@ def test_a_curve_of_floats(tmp_path):
     table = matrix_profile([curv(0, 10000, 65535)])
     path = tiff(tmp_path / "c.tif", [page(floats, 2, form=3, t34675=(7, list(table)))])
     refused(path, "floats out of [0, 1]")
+
+
+def test_an_infinite_pixel_stays_infinite_through_a_matrix(tmp_path):
+    floats = np.tile(np.array([0.25, 0.5, 0.75], np.float32), (4, 8, 1))
+    floats[1, 2, 0] = np.inf
+    primaries = (5, [(round(1000 * value), 1000) for value in P3])
+    pixels = read_image(tiff(tmp_path / "a.tif", [page(floats, 2, form=3, t319=primaries)])).pixels
+    np.testing.assert_array_equal(pixels[1, 2], [np.inf, 0.5, 0.75])
+    assert np.isfinite(np.delete(pixels.reshape(-1, 3), 8 + 2, axis=0)).all()
 
 
 def test_big_tiff(tmp_path):
@@ -812,6 +822,21 @@ def test_adobe_rgb_by_exif(tmp_path, stated):
     # A profile says more than Exif, and a chunk sRGB of a PNG too.
     Pillow.fromarray(codes).save(path, exif=exif.tobytes(), icc_profile=matrix_profile([SRGB_PARA]))
     assert read_image(path).notices == ()
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+def test_gamma_and_primaries_by_exif(tmp_path, suffix):
+    """In every format that has Exif; codes of one grey survive JPEG."""
+    ratio = TiffImagePlugin.IFDRational
+    exif = Pillow.Exif()
+    exif[0x8769] = {0xA001: 65535, 0xA500: ratio(18, 10)}
+    exif[318] = ratio(3127, 10000), ratio(3290, 10000)
+    exif[319] = tuple(ratio(round(1000 * value), 1000) for value in P3)
+    path = tmp_path / f"a.{suffix}"
+    Pillow.new("RGB", (8, 4), (99, 99, 99)).save(path, exif=exif.tobytes(), quality=100)
+    image = read_image(path)
+    np.testing.assert_allclose(image.pixels, (99 / 255) ** 1.8, rtol=0.01)
+    assert "its Exif (gamma 1.8, primaries 0.68" in image.notices[0]
 
 
 def test_panoramas_say_what_they_are(tmp_path):

@@ -195,7 +195,11 @@ class Encoding:
             light = rows[..., :3]
             with np.errstate(all="ignore"):
                 converted = light @ transposed
-                # What the file itself states as negative or as NaN is not a matter of the gamut.
+                if not np.isfinite(converted).all():
+                    # An infinite channel would make all three of its pixel NaN: such pixels stay as they are.
+                    endless = ~np.isfinite(light).all(axis=2)
+                    converted[endless] = light[endless]
+                # What the file itself states as negative is not a matter of the gamut.
                 outside = (converted < 0) & (light.min(axis=2) >= 0)[..., None]
                 if outside.any():
                     below = converted[outside]

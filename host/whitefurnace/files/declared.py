@@ -23,12 +23,10 @@ from whitefurnace.files.colour import (
     from_primaries,
     power,
 )
+from whitefurnace.files.exif import read_exif
 from whitefurnace.files.icc import MAX_BYTES, read_icc
-from whitefurnace.files.tiff import directories, directory, read_tiff
+from whitefurnace.files.tiff import read_tiff
 
-# Adobe RGB (1998) Color Image Encoding, 4.3.1: the exponent 563/256 and the primaries.
-_ADOBE_RGB = (0.64, 0.33, 0.21, 0.71, 0.15, 0.06, 0.3127, 0.3290)
-_ADOBE_CURVE = power(563 / 256)
 # OpenImageIO's names of colour spaces with the primaries of Rec. 709; "" and None stand for nothing stated.
 _SPACES = {"srgb_rec709_scene": SRGB_CURVE, "sRGB": SRGB_CURVE, "lin_rec709_scene": LINEAR, "linear": LINEAR}
 
@@ -78,13 +76,14 @@ def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Decla
         if form == "jpeg2000":
             _check_jpeg2000(path)
         encoding = _by_attributes(spec, form, path, channels)
-    if encoding is None:
-        encoding = _exif(spec)
     return Declared(encoding, associated, inverted)
 
 
 def _check_aspect(spec: Any, path: Path) -> None:
-    aspect = float(spec.get_float_attribute("PixelAspectRatio", 1.0))
+    aspect = float(spec.get_float_attribute("PixelAspectRatio", 0.0))
+    x, y = (float(spec.get_float_attribute(f"{axis}Resolution", 0.0)) for axis in "XY")
+    if aspect == 0 and x > 0 and y > 0:
+        aspect = y / x
     if aspect > 0 and not 0.99 < aspect < 1.01:
         raise InputError(
             f"{path} states pixels of the aspect ratio {aspect:.4g}; square pixels were expected, or no resolution"
@@ -151,22 +150,13 @@ def _check_panorama(spec: Any, path: Path, notices: list[str]) -> None:
         )
 
 
-def _exif(spec: Any) -> Encoding | None:
-    """Return Adobe RGB where Exif's ColorSpace is 2, as programs write it."""
-    return _adobe_rgb() if spec.getattribute("Exif:ColorSpace") == 2 else None
-
-
-def _adobe_rgb() -> Encoding:
-    return Encoding((_ADOBE_CURVE,), "its Exif (Adobe RGB)", from_primaries(_ADOBE_RGB))
-
-
 # --- PNG ------------------------------------------------------------------------------------------------
 
-_COLOUR_CHUNKS = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"acTL")
+_COLOUR_CHUNKS = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"eXIf", b"acTL")
 
 
 def _png(path: Path, channels: int) -> Encoding | None:
-    """Return the encoding of a PNG, by the order cICP, iCCP, sRGB, then gAMA and cHRM [PNG 3, 4.3]."""
+    """Return the encoding of a PNG, by the order cICP, iCCP, sRGB, gAMA and cHRM [PNG 3, 4.3], then Exif."""
     found: dict[bytes, bytes] = {}
     with open(path, "rb") as file:
         for kind, length in _png_chunks(file):
@@ -192,7 +182,7 @@ def _png(path: Path, channels: int) -> Encoding | None:
     if b"sRGB" in found:
         return Encoding((SRGB_CURVE,), "")
     if not (b"gAMA" in found or b"cHRM" in found):
-        return None
+        return read_exif(found.get(b"eXIf", b""), path)
     curve: Curve = SRGB_CURVE
     said = []
     if b"gAMA" in found:
@@ -249,7 +239,7 @@ def _inflated(body: bytes, path: Path) -> bytes:
 
 # --- JPEG -----------------------------------------------------------------------------------------------
 
-_ICC = b"ICC_PROFILE\0"
+_ICC, _EXIF = b"ICC_PROFILE\0", b"Exif\0\0"
 
 
 def _jpeg(path: Path, spec: Any, channels: int, notices: list[str]) -> Encoding | None:
@@ -259,14 +249,15 @@ def _jpeg(path: Path, spec: Any, channels: int, notices: list[str]) -> Encoding 
         raise InputError(f"{path} is a JPEG of inks ({space}), grey and RGB are read; convert it to sRGB")
     pieces: dict[int, bytes] = {}
     counts = set()
-    gain_map = adobe_rgb = False
+    gain_map, exif = False, b""
     with open(path, "rb") as file:
         for marker, length in _jpeg_segments(file):
             if marker not in (0xE1, 0xE2):
                 continue
             body = file.read(length)
             gain_map |= b"hdrgm:Version" in body or body.startswith(b"urn:iso:std:iso:ts:21496")
-            adobe_rgb |= marker == 0xE1 and _is_adobe_rgb(body)
+            if marker == 0xE1 and body.startswith(_EXIF):
+                exif = exif or body[6:]
             if marker == 0xE2 and body.startswith(_ICC) and len(body) > 14:
                 if body[12] in pieces:
                     raise InputError(f"{path} is corrupted: part {body[12]} of its ICC profile is there twice")
@@ -275,24 +266,10 @@ def _jpeg(path: Path, spec: Any, channels: int, notices: list[str]) -> Encoding 
     if gain_map:
         notices.append(f"{path}: has a gain map for displays of high range, which was left out; its picture was read")
     if not pieces:
-        return _adobe_rgb() if adobe_rgb else None
+        return read_exif(exif, path)
     if len(counts) != 1 or sorted(pieces) != list(range(1, counts.pop() + 1)):
         raise InputError(f"{path} is corrupted: its ICC profile is not complete, parts {sorted(pieces)} are there")
     return read_icc(b"".join(pieces[k] for k in sorted(pieces)), path, "its APP2 segment", channels)
-
-
-def _is_adobe_rgb(body: bytes) -> bool:
-    """Return whether a segment APP1 is Exif with the interoperability index R03, which is Adobe RGB [DCF 2.0, 5.2]."""
-    if not body.startswith(b"Exif\0\0"):
-        return False
-    data = body[6:]
-    try:
-        first = next(directories(data, (34665,)))
-        second, _ = directory(data, int(first[34665][0]), (40965,))
-        third, _ = directory(data, int(second[40965][0]), (1,))
-        return bytes(third[1]).startswith(b"R03")  # type: ignore[arg-type]
-    except (struct.error, LookupError, TypeError, ValueError, OverflowError, StopIteration):
-        return False
 
 
 def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
@@ -323,21 +300,25 @@ def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
 
 def _webp(path: Path, channels: int) -> Encoding | None:
     """Return the encoding of the profile in the chunk ICCP. Refuses animations."""
-    profile = None
+    found: dict[bytes, bytes] = {}
     frames = 0
     with open(path, "rb") as file:
         at = 12
         while len(head := _at(file, at, 8)) == 8:
             kind, length = struct.unpack("<4sI", head)
             frames += kind == b"ANMF"
-            if kind == b"ICCP" and profile is None:
+            if kind in (b"ICCP", b"EXIF") and kind not in found:
                 if length > MAX_BYTES:
-                    raise InputError(f"{path} has an ICC profile of {length} bytes, at most {MAX_BYTES} are read")
-                profile = file.read(length)
+                    raise InputError(
+                        f"{path} has a chunk {kind.decode()} of {length} bytes, at most {MAX_BYTES} are read"
+                    )
+                found[kind] = file.read(length)
             at += 8 + length + length % 2
     if frames > 1:
         raise InputError(f"{path} is an animation of {frames} frames, a single image was expected")
-    return None if profile is None else read_icc(profile, path, "its ICCP chunk", channels)
+    if b"ICCP" in found:
+        return read_icc(found[b"ICCP"], path, "its ICCP chunk", channels)
+    return read_exif(found.get(b"EXIF", b"").removeprefix(_EXIF), path)
 
 
 def _at(file: BinaryIO, offset: int, length: int) -> bytes:

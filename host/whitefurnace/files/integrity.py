@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from whitefurnace.errors import InputError
-from whitefurnace.files.tiff import COMPRESSION, MAGIC, directories
+from whitefurnace.files.tiff_tags import COMPRESSION, MAGIC, directories
 
 _ZLIB_TIFF = (8, 32946)
 

@@ -1,10 +1,9 @@
-"""Reads the directories (tags) of a TIFF or BigTIFF file, and says what its first image states about itself."""
+"""Reads what the first image of a TIFF states about its colour and its samples."""
 
 from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,15 +11,12 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import InputError
-from whitefurnace.files.colour import LINEAR, REC709, SRGB_CURVE, Curve, Encoding, from_primaries
+from whitefurnace.files.colour import LINEAR, SRGB_CURVE, Curve, Encoding
+from whitefurnace.files.exif import read_exif
 from whitefurnace.files.icc import MAX_BYTES, read_icc
+from whitefurnace.files.tiff_tags import PRIMARIES, WHITE, Values, chromaticities, directories
 
-MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
-
-SUBFILE, BITS, COMPRESSION, PHOTOMETRIC = 254, 258, 259, 262
-_PAGE_LIMIT = 1000
-_VALUE_LIMIT = 1 << 20
-_TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "II", 7: "B", 8: "h", 9: "i", 11: "f", 12: "d", 13: "I", 16: "Q", 18: "Q"}
+_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _COLOR_MAP = 254, 255, 258, 262, 320
 _READ_PHOTOMETRIC = {0: "MinIsWhite", 1: "MinIsBlack", 2: "RGB", 3: "palette", 6: "YCbCr"}
 _OTHER_PHOTOMETRIC = {
     4: "a transparency mask",
@@ -33,9 +29,6 @@ _OTHER_PHOTOMETRIC = {
     32845: "LogLuv",
     34892: "linear raw",
 }
-_WHITE_DEFAULT = REC709[6:]
-
-Values = Sequence[int | float]
 
 
 @dataclass(frozen=True)
@@ -52,59 +45,9 @@ class Tiff:
     inverted: bool
 
 
-def directories(data: mmap.mmap | bytes, wanted: Collection[int]) -> Iterator[dict[int, Values]]:
-    """Yield the tags in `wanted` of each image of a file, of rationals their quotient.
-
-    Raises `struct.error`, `LookupError` or `ValueError` where the file ends too early or its directories form a circle.
-    """
-    big = 43 in (data[2], data[3])
-    (at,) = struct.unpack_from(_order(data) + ("Q" if big else "I"), data, 8 if big else 4)
-    seen: set[int] = set()
-    while at:
-        if at in seen or len(seen) > _PAGE_LIMIT:
-            raise ValueError("its directories form a circle")
-        seen.add(at)
-        tags, at = directory(data, at, wanted)
-        yield tags
-
-
-def directory(data: mmap.mmap | bytes, at: int, wanted: Collection[int]) -> tuple[dict[int, Values], int]:
-    """Return the tags in `wanted` of the directory at byte `at`, and where the next one is; 0 after the last."""
-    order = _order(data)
-    big = 43 in (data[2], data[3])
-    offset, count, entry, inline = ("Q", "Q", 20, 8) if big else ("I", "H", 12, 4)
-    (entries,) = struct.unpack_from(order + count, data, at)
-    at += struct.calcsize(order + count)
-    tags: dict[int, Values] = {}
-    for k in range(min(entries, 65535)):
-        tag, kind, number = struct.unpack_from(order + "HH" + offset, data, at + k * entry)
-        value = at + k * entry + entry - inline
-        form = _TYPES.get(kind)
-        if tag not in wanted or form is None or number > len(data):
-            continue
-        size = struct.calcsize(order + form)
-        if number > _VALUE_LIMIT and form != "B":
-            raise ValueError(f"its tag {tag} has {number} values")
-        if number * size > inline:
-            (value,) = struct.unpack_from(order + offset, data, value)
-        if value + number * size > len(data):
-            raise ValueError(f"its tag {tag} reaches beyond the end of the file")
-        if form == "B":
-            tags[tag] = bytes(data[value : value + number])
-            continue
-        found = struct.unpack_from(f"{order}{number * len(form)}{form[0]}", data, value)
-        if form == "II":
-            found = tuple(a / b if b else float("nan") for a, b in zip(found[::2], found[1::2], strict=True))
-        tags[tag] = found
-    (following,) = struct.unpack_from(order + offset, data, at + entries * entry)
-    return tags, int(following)
-
-
-def _order(data: mmap.mmap | bytes) -> str:
-    return "<" if data[:1] == b"I" else ">"
-
-
-_WANTED = {SUBFILE, BITS, PHOTOMETRIC, 277, 282, 283, 290, 291, 301, 318, 319, 338, 339, 532, 34675}
+_WANTED = {_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _COLOR_MAP, WHITE, PRIMARIES} | {
+    *(282, 283, 290, 291, 301, 338, 339, 532, 34675)
+}
 
 
 def read_tiff(path: Path) -> Tiff:
@@ -115,13 +58,14 @@ def read_tiff(path: Path) -> Tiff:
         except (struct.error, LookupError, ValueError, OverflowError) as error:
             said = f" ({error})" if isinstance(error, ValueError) else ""
             raise InputError(f"{path} is truncated or corrupted: its TIFF directories cannot be read{said}") from None
-    if not pages:
-        raise InputError(f"{path} is a TIFF without an image")
-    _check_pages(pages, path)
-    first = pages[0]
-    _check_samples(first, path)
-    inverted = _whole(first, PHOTOMETRIC, -1) == 0 and _whole(first, BITS, 1) > 8
-    return Tiff(_encoding(first, path), _whole(first, 338, 0) == 1, inverted)
+        if not pages:
+            raise InputError(f"{path} is a TIFF without an image")
+        _check_pages(pages, path)
+        first = pages[0]
+        _check_samples(first, path)
+        encoding = _encoding(first, data, path)
+    inverted = _whole(first, _PHOTOMETRIC, -1) == 0 and _whole(first, _BITS, 1) > 8
+    return Tiff(encoding, _whole(first, 338, 0) == 1, inverted)
 
 
 def _whole(tags: dict[int, Values], tag: int, default: int) -> int:
@@ -131,7 +75,7 @@ def _whole(tags: dict[int, Values], tag: int, default: int) -> int:
 
 def _check_pages(pages: list[dict[int, Values]], path: Path) -> None:
     """Refuse a first page that is a thumbnail or a mask, and several pages of which none is told apart."""
-    kinds = [_whole(page, SUBFILE, 0) for page in pages]
+    kinds = [_whole(page, _SUBFILE, 0) | (_whole(page, _OLD_SUBFILE, 1) == 2) for page in pages]
     if kinds[0] & 5:
         what = "a transparency mask" if kinds[0] & 4 else "a copy of reduced size"
         raise InputError(f"{path} has {what} as the first of its {len(pages)} images, an image was expected there")
@@ -141,13 +85,13 @@ def _check_pages(pages: list[dict[int, Values]], path: Path) -> None:
 
 
 def _check_samples(tags: dict[int, Values], path: Path) -> None:
-    photometric = _whole(tags, PHOTOMETRIC, -1)
+    photometric = _whole(tags, _PHOTOMETRIC, -1)
     if photometric not in _READ_PHOTOMETRIC:
         name = _OTHER_PHOTOMETRIC.get(photometric, "an unknown kind")
         known = ", ".join(_READ_PHOTOMETRIC.values())
         stated = f"the photometric interpretation {photometric} ({name})" if photometric >= 0 else "no interpretation"
         raise InputError(f"{path} states {stated}, {known} are read; convert it to RGB")
-    bits, formats = set(tags.get(BITS, (1,))), set(tags.get(339, (1,)))
+    bits, formats = set(tags.get(_BITS, (1,))), set(tags.get(339, (1,)))
     if len(bits) > 1 or len(formats) > 1:
         raise InputError(f"{path} has channels of several depths or kinds, one for all was expected")
     form, depth = int(formats.pop()), int(bits.pop())
@@ -162,6 +106,9 @@ def _check_samples(tags: dict[int, Values], path: Path) -> None:
         )
     if form == 3 and photometric == 0:
         raise InputError(f"{path} holds floats and states that the least is white, the least as black was expected")
+    # OpenImageIO cuts the colours to 8 bits, so that other ones become darker by up to a code.
+    if photometric == 3 and any(value % 257 for value in tags.get(_COLOR_MAP, ())):
+        raise InputError(f"{path} has a palette (ColorMap) of 16 bits, those of 8 are read; convert it to RGB")
     if 290 in tags or 291 in tags:
         raise InputError(f"{path} states a curve of optical densities (GrayResponseCurve), which is not read")
     if 532 in tags and photometric != 6:
@@ -179,9 +126,9 @@ def _check_samples(tags: dict[int, Values], path: Path) -> None:
         )
 
 
-def _encoding(tags: dict[int, Values], path: Path) -> Encoding | None:
-    """Return the encoding of an ICC profile, else that of the tags for curves and primaries."""
-    grey = _whole(tags, PHOTOMETRIC, -1) in (0, 1)
+def _encoding(tags: dict[int, Values], file: mmap.mmap, path: Path) -> Encoding | None:
+    """Return the encoding of an ICC profile, else of TransferFunction, of Exif or of the tags for primaries."""
+    grey = _whole(tags, _PHOTOMETRIC, -1) in (0, 1)
     if 34675 in tags:
         data = tags[34675]
         if not isinstance(data, bytes):
@@ -189,36 +136,25 @@ def _encoding(tags: dict[int, Values], path: Path) -> Encoding | None:
         if len(data) > MAX_BYTES:
             raise InputError(f"{path} holds an ICC profile of over {MAX_BYTES} bytes, which is not read")
         return read_icc(data, path, "its tag 34675", 1 if grey else 3)
-    curves: tuple[Curve, ...] = ()
-    said = []
-    if 301 in tags:
-        curves = _transfer(tags, path)
-        said.append("TransferFunction")
-    matrix = None
-    if 318 in tags or 319 in tags:
-        xy = (*tags.get(319, REC709[:6]), *tags.get(318, _WHITE_DEFAULT))
-        shown = " ".join(f"{float(value):.4g}" for value in xy[:8])
-        try:
-            if len(xy) != 8 or not all(np.isfinite(xy)):
-                raise ValueError
-            matrix = from_primaries([float(value) for value in xy])
-        except ValueError:
-            raise InputError(f"{path} states primaries ({shown}) that span no colour space") from None
-        said.append(f"PrimaryChromaticities and WhitePoint ({shown})")
-    if not said:
-        return None
     floats = _whole(tags, 339, 1) == 3
-    if not curves:
-        curves = (LINEAR if floats else SRGB_CURVE,)
-    return Encoding(curves, f"its TIFF tags {' and '.join(said)}", matrix)
+    default = LINEAR if floats else SRGB_CURVE
+    if 301 not in tags and (encoding := read_exif(file, path, default)) is not None:
+        return encoding
+    said = ["TransferFunction"] if 301 in tags else []
+    curves = _transfer(tags, path) if 301 in tags else (default,)
+    matrix = None
+    if WHITE in tags or PRIMARIES in tags:
+        matrix, shown = chromaticities(tags, path)
+        said.append(f"PrimaryChromaticities and WhitePoint ({shown})")
+    return Encoding(curves, f"its TIFF tags {' and '.join(said)}", matrix) if said else None
 
 
 def _transfer(tags: dict[int, Values], path: Path) -> tuple[Curve, ...]:
     """Return the curves of the tag TransferFunction: one or three tables of an entry for each code [TIFF 6.0, 20]."""
-    depth = _whole(tags, BITS, 1)
+    depth = _whole(tags, _BITS, 1)
     count = 1 << depth if depth <= 16 else 0
     values: npt.NDArray[np.float64] = np.array(tags[301], np.float64)
-    if not count or len(values) not in (count, 3 * count) or _whole(tags, PHOTOMETRIC, -1) in (0, 3):
+    if not count or len(values) not in (count, 3 * count) or _whole(tags, _PHOTOMETRIC, -1) in (0, 3):
         raise InputError(
             f"{path} has a TransferFunction of {len(values)} entries, one or three tables of 2^{depth} were expected"
         )
