@@ -149,7 +149,7 @@ def test_a_job_is_checked_whole_before_anything_runs(tmp_path, shell, text, word
 def test_every_option_of_bake_and_lut_is_in_a_job():
     from whitefurnace.cli import cli
 
-    own = {"environments", "output", "device", "dry_run", "force", "as_json", "quiet", "kind"}
+    own = {"environments", "output", "device", "dry_run", "force", "as_json", "quiet", "kind", "memory", "debug"}
     for name, table in batch.TABLES.items():
         there = {p.name for p in cli.commands[name].params} - own
         there = {{"axes": "axis", "fixed": "set", "stored": "format"}.get(p, p) for p in there}

@@ -7,6 +7,7 @@ and on a cluster.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import fnmatch
 import json
 import math
@@ -15,11 +16,12 @@ import re
 import tempfile
 import time
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast, get_type_hints
 
 import msgspec
 
@@ -45,6 +47,7 @@ from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
 from whitefurnace.sphere.environments import extent, source_files
 from whitefurnace.tables import lut as tables
 from whitefurnace.tables.axes import named, named_axes
+from whitefurnace.tables.request import TableRequest
 
 MOST_BYTES = 16 << 20
 """Largest size of a job file; ten thousand paths take about one megabyte."""
@@ -61,34 +64,26 @@ MOST_REPORTED = 10
 
 
 class Bake(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_": "for"}, omit_defaults=True):
-    """A table `[[bake]]` of a job: environments (paths and patterns), the output folder, and options of `bake`."""
+    """A table `[[bake]]` of a job: environments (paths and patterns), the output folder, and options of `bake`.
+
+    These are the fields that a job writes in its own way; `TABLES` has the other options of a `BakeRequest` too.
+    """
 
     environments: list[str]
     output: str
     for_: list[str] | None = None
-    size: int | None = None
-    min_size: int | None = None
-    levels: int | None = None
-    fit: str | None = None
-    as_read: bool = False
-    ndf: str = "ggx"
-    tolerance: float | None = None
-    quality: str | None = None
-    samples: int | None = None
-    certify: int | None = None
-    rotate: float = 0.0
-    exposure: float = 0.0
-    nonfinite: str = "refuse"
-    sun: str = "keep"
-    sh: str | None = None
     without: list[str] | None = None
-    only_levels: str | None = None
-    table: int | None = None
+    certify: int | None = None
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
 
 
 class Lut(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_": "for"}, omit_defaults=True):
     """A table `[[lut]]` of a job: kind, output file, and options of `lut`.
 
+    These are the fields that a job writes in its own way; `TABLES` has the other options of a `TableRequest` too.
     `axis` and `set` are lists of the values of these options.
     """
 
@@ -98,27 +93,38 @@ class Lut(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_
     axis: list[str] = []
     set: list[str] = []
     for_: str | None = None
-    fit: str | None = None
-    as_read: bool = False
     format: str | None = None
-    scheme: str | None = None
-    ndf: str | None = None
-    masking: str | None = None
-    fresnel: str | None = None
-    diffuse: str | None = None
-    brdf: str | None = None
-    light: str | None = None
     environment: str | None = None
     normal: tuple[float, float, float] | None = None
-    rotate: float = 0.0
-    exposure: float = 0.0
-    nonfinite: str = "refuse"
-    backfacing: str | None = None
-    precision: int = 32
-    tolerance: float | None = None
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
 
 
-TABLES: dict[str, type[Bake] | type[Lut]] = {"bake": Bake, "lut": Lut}
+_T = TypeVar("_T", bound=msgspec.Struct)
+
+
+def _with_options(own: type[_T], request: type, elsewhere: Collection[str]) -> type[_T]:
+    """Return `own` with the other options of `request`, so that a new option is written once.
+
+    elsewhere: options that a table of a job does not have, or has by another name. A model is a text in a job.
+    """
+    python_only = {"np": SimpleNamespace(ndarray=object), "Environment": object, "AxisSpec": object, "Source": object}
+    types = get_type_hints(request, localns={**python_only, "Spec": str})
+    options = [
+        (option.name, types[option.name], option.default)
+        for option in dataclasses.fields(request)
+        if option.name not in {*own.__struct_fields__, *elsewhere}
+    ]
+    made = msgspec.defstruct(own.__name__, options, bases=(own,), frozen=True)
+    return cast(type[_T], made)
+
+
+TABLES: dict[str, type[Bake] | type[Lut]] = {
+    "bake": _with_options(Bake, BakeRequest, ("sources", "force")),
+    "lut": _with_options(Lut, TableRequest, ("path", "axes", "parameters", "stored", "force")),
+}
 MODELS = ("ndf", "masking", "fresnel", "diffuse", "brdf", "light")
 """Options that name a model, or a file with a user's model."""
 
@@ -670,7 +676,7 @@ def _table_plan(recipe: str, kind: str, output: str, force: bool) -> tables.Tabl
     options = json.loads(recipe)["options"]
     axes, fixed = options.pop("axis", []), options.pop("set", [])
     return tables.plan(
-        tables.TableRequest(
+        TableRequest(
             kind,
             output,
             force=force,
