@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import pytest
 from PIL import Image as Pillow
 from PIL import ImageCms, ImageOps, TiffImagePlugin
 
+from whitefurnace.cli import main
 from whitefurnace.errors import InputError
 from whitefurnace.files import image_facts, read_image
 from whitefurnace.sphere.environments import environment, extent
@@ -300,6 +303,17 @@ def test_gama(tmp_path):
     refused(png(tmp_path / "c.png", codes, (b"gAMA", bytes(4))), "gamma of 0")
     refused(png(tmp_path / "d.png", codes, (b"gAMA", bytes(3))), "gAMA has 3 bytes")
     refused(png(tmp_path / "e.png", codes, gama(1), gama(1)), "gAMA more than once")
+
+
+def test_notices_are_told_once(tmp_path, capsys):
+    """`inspect` prints a notice and writes it as JSON, and Python's environment has it."""
+    path = png(tmp_path / "a.png", codes16(pattern() / 2), gama(1))
+    for arguments in (["inspect", str(path)], ["inspect", str(path), "--json"]):
+        with contextlib.suppress(SystemExit):
+            main(arguments)
+        out, err = capsys.readouterr()
+        assert (out + err).count("gAMA (1)") == 1
+    assert sum("gAMA (1)" in notice for notice in environment(path).notices) == 1
 
 
 def test_chrm(tmp_path):
@@ -755,6 +769,26 @@ def test_tiffs_that_are_refused(tmp_path, pages, words):
 def test_copies_of_reduced_size_do_not_count(tmp_path):
     path = tiff(tmp_path / "a.tif", [page(RGB8, 2), page(RGB8[:2, :4], 2, t254=(4, [1]))])
     assert read_image(path).pixels.shape == (4, 8, 3)
+
+
+def test_many_pages_that_state_the_same_numbers_take_no_memory(tmp_path):
+    """500 directories whose TransferFunction is the same 200 kB: as Python's numbers they would be 2 GB."""
+    path = tiff(tmp_path / "a.tif", [page(RGB8, 2, t301=(3, [0] * 100_000)), *[page(RGB8, 2, t254=(4, [1]))] * 500])
+    data = bytearray(path.read_bytes())
+    first = struct.unpack_from("<I", data, 4)[0]
+    entry = next(data[at : at + 12] for at in range(first + 2, first + 200, 12) if data[at : at + 2] == b"\x2d\1")
+    at = first
+    while at:  # the entry of 254 becomes another one of 301
+        count = struct.unpack_from("<H", data, at)[0]
+        for k in range(count):
+            if data[at + 2 + 12 * k : at + 4 + 12 * k] == b"\xfe\0" and at != first:
+                data[at + 2 + 12 * k : at + 14 + 12 * k] = entry
+        at = struct.unpack_from("<I", data, at + 2 + 12 * count)[0]
+    path.write_bytes(data)
+    tracemalloc.start()
+    refused(path, "501 images of full size")
+    assert tracemalloc.get_traced_memory()[1] < 100e6
+    tracemalloc.stop()
 
 
 def test_a_curve_of_floats(tmp_path):

@@ -298,14 +298,20 @@ def _jpeg_segments(file: BinaryIO) -> Iterator[tuple[int, int]]:
 # --- WebP -----------------------------------------------------------------------------------------------
 
 
+_MOST_CHUNKS = 100_000
+
+
 def _webp(path: Path, channels: int) -> Encoding | None:
     """Return the encoding of the profile in the chunk ICCP. Refuses animations."""
     found: dict[bytes, bytes] = {}
-    frames = 0
+    frames = chunks = 0
     with open(path, "rb") as file:
         at = 12
         while len(head := _at(file, at, 8)) == 8:
             kind, length = struct.unpack("<4sI", head)
+            chunks += 1
+            if chunks > _MOST_CHUNKS:
+                raise InputError(f"{path} has more than {_MOST_CHUNKS} chunks, an image has a few")
             frames += kind == b"ANMF"
             if kind in (b"ICCP", b"EXIF") and kind not in found:
                 if length > MAX_BYTES:

@@ -62,7 +62,9 @@ class Radiance:
         A texel 1 1 1 n repeats the one before it n times; of several in a row each counts 256 times the one before.
         Raises `InputError` where the number of texels is not that of the header.
         """
-        size = path.stat().st_size - self.start
+        size, total = path.stat().st_size - self.start, self.lines * self.length
+        if size == 4 * total:
+            return None
         with open(path, "rb") as file:
             file.seek(self.start)
             if file.read(4) == bytes((2, 2, self.length >> 8 & 255, self.length & 255)) or size < 8:
@@ -71,8 +73,7 @@ class Radiance:
             require(30 * size, f"{size // 4} texels in the old run-length code", path)
             texels = np.frombuffer(file.read(size - size % 4), np.uint8).reshape(-1, 4)
         marks = np.all(texels[:, :3] == 1, axis=1)
-        total = self.lines * self.length
-        if not marks.any() or len(texels) == total:
+        if not marks.any():
             return None
         index = np.arange(len(texels))
         last = np.maximum.accumulate(np.where(marks, -1, index))  # the texel that each repeats

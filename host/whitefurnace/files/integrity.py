@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from whitefurnace.errors import InputError
+from whitefurnace.files.memory import require
 from whitefurnace.files.tiff_tags import COMPRESSION, MAGIC, directories
 
 _ZLIB_TIFF = (8, 32946)
@@ -60,7 +61,7 @@ def _check_png(path: Path, size: int) -> None:
             if kind == b"IDAT" and rows is not None and rows.indexed and not palette:
                 raise InputError(f"{path} is corrupted: its pixels are of a palette (PLTE), which is not before them")
             if kind == b"IHDR":
-                rows = _Rows(b"".join(blocks), path)
+                rows = _Rows(b"".join(blocks), path, size)
             if kind == b"IEND":
                 break
             start += 12 + length
@@ -70,6 +71,7 @@ def _check_png(path: Path, size: int) -> None:
 
 # Of Adam7: first column and row, and the steps of both, for each of the seven passes [PNG 3, 8.1].
 _PASSES = ((0, 0, 8, 8), (4, 0, 8, 8), (0, 4, 4, 8), (2, 0, 4, 4), (0, 2, 2, 4), (1, 0, 2, 2), (0, 1, 1, 2))
+_MAX_RATIO = 1032  # deflate packs at most 258 bytes into two bits [RFC 1951, 3.2.5]
 _SURPLUS = 1 << 16  # bytes after the rows, from which on the end of the data is not looked for
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
 _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 16)}
@@ -78,7 +80,7 @@ _DEPTHS = {0: (1, 2, 4, 8, 16), 2: (8, 16), 3: (1, 2, 4, 8), 4: (8, 16), 6: (8, 
 class _Rows:
     """The deflated rows of a PNG: inflates them as they come, and looks at the filter of each."""
 
-    def __init__(self, header: bytes, path: Path) -> None:
+    def __init__(self, header: bytes, path: Path, size: int) -> None:
         self._path = path
         if len(header) != 13:
             raise self._wrong(f"its header has {len(header)} bytes, 13 were expected")
@@ -96,6 +98,12 @@ class _Rows:
             for x, y, dx, dy in passes
             if height > y and width > x
         ]
+        total = sum(count * stride for count, stride in self._spans)
+        if total > _MAX_RATIO * size + 64:
+            raise InputError(
+                f"{path} states a size of {width} x {height}, but its {size} bytes cannot hold that many pixels"
+            )
+        require(total, f"its {width} x {height} pixels", path, size)
         self.indexed = colour == 3
         self._inflate = zlib.decompressobj()
         self._passed = 0  # bytes of the current span, and after the last one those that nobody needs

@@ -54,14 +54,15 @@ def read_tiff(path: Path) -> Tiff:
     """Return what the first image of a TIFF states. Raises `InputError` for what is not read."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
-            pages = list(directories(data, _WANTED))
+            # Of later pages only a few numbers are kept: many could state the same megabytes.
+            pages = list(directories(data, (_SUBFILE, _OLD_SUBFILE), 16))
+            first = next(directories(data, _WANTED)) if pages else {}
         except (struct.error, LookupError, ValueError, OverflowError) as error:
             said = f" ({error})" if isinstance(error, ValueError) else ""
             raise InputError(f"{path} is truncated or corrupted: its TIFF directories cannot be read{said}") from None
         if not pages:
             raise InputError(f"{path} is a TIFF without an image")
         _check_pages(pages, path)
-        first = pages[0]
         _check_samples(first, path)
         encoding = _encoding(first, data, path)
     inverted = _whole(first, _PHOTOMETRIC, -1) == 0 and _whole(first, _BITS, 1) > 8

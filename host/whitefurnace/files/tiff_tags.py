@@ -23,8 +23,12 @@ _TYPES = {1: "B", 2: "B", 3: "H", 4: "I", 5: "II", 7: "B", 8: "h", 9: "i", 11: "
 Values = Sequence[int | float]
 
 
-def directories(data: mmap.mmap | bytes, wanted: Collection[int]) -> Iterator[dict[int, Values]]:
+def directories(
+    data: mmap.mmap | bytes, wanted: Collection[int], most: int = _VALUE_LIMIT
+) -> Iterator[dict[int, Values]]:
     """Yield the tags in `wanted` of each image of a file, of rationals their quotient.
+
+    most: the largest number of values in a tag that is read.
 
     Raises `struct.error`, `LookupError` or `ValueError` where the file ends too early or its directories form a circle.
     """
@@ -35,11 +39,13 @@ def directories(data: mmap.mmap | bytes, wanted: Collection[int]) -> Iterator[di
         if at in seen or len(seen) > _PAGE_LIMIT:
             raise ValueError("its directories form a circle")
         seen.add(at)
-        tags, at = directory(data, at, wanted)
+        tags, at = directory(data, at, wanted, most)
         yield tags
 
 
-def directory(data: mmap.mmap | bytes, at: int, wanted: Collection[int]) -> tuple[dict[int, Values], int]:
+def directory(
+    data: mmap.mmap | bytes, at: int, wanted: Collection[int], most: int = _VALUE_LIMIT
+) -> tuple[dict[int, Values], int]:
     """Return the tags in `wanted` of the directory at byte `at`, and where the next one is; 0 after the last."""
     order = _order(data)
     big = 43 in (data[2], data[3])
@@ -54,7 +60,7 @@ def directory(data: mmap.mmap | bytes, at: int, wanted: Collection[int]) -> tupl
         if tag not in wanted or form is None or number > len(data):
             continue
         size = struct.calcsize(order + form)
-        if number > _VALUE_LIMIT and form != "B":
+        if number > most and (form != "B" or most < _VALUE_LIMIT):
             raise ValueError(f"its tag {tag} has {number} values")
         if number * size > inline:
             (value,) = struct.unpack_from(order + offset, data, value)
