@@ -400,3 +400,72 @@ def test_charlie_with_neubelts_visibility_as_glsl(device: Device, write: WriteFi
         want = 2 * math.pi / 800 * (f * (z * wz)[:, None]).sum()
         got = integrate("albedo", brdf=str(path), NoV=0.1, phi=0.0, alpha=alpha, device=device).values[0]
         assert abs(got - want) <= 1e-4  # of the quadrature here
+
+
+PIECES = (
+    "{ } ( ) [ ] ; , . \n # \\ \" ' /* */ // 1.0 1f .5e3 0x1 1e 9z real real3 float vec3 int T W in out const "
+    "static constant struct typedef return if for ? : = == + - * / \u03b1 \0 #define #include #if #endif #line "
+    "precision l.z x.rgb"
+).split(" ")
+
+
+def broken(rng: np.random.Generator, text: str) -> str:
+    """The text with a few places cut, doubled, exchanged or replaced by a piece of the language."""
+    for _ in range(int(rng.integers(1, 4))):
+        a, b = sorted(int(v) for v in rng.integers(0, len(text) + 1, 2))
+        b = min(b, a + 30)
+        piece = PIECES[int(rng.integers(len(PIECES)))]
+        text = (
+            text[:a] + text[b:],
+            text[:b] + text[a:],
+            text[:a] + piece + text[a:],
+            text[:a] + piece + text[b:],
+            text[:a],
+        )[int(rng.integers(5))]
+    return text
+
+
+def translated(write: WriteFile, count: int, seed: int) -> int:
+    """Translate broken texts; each is translated, or refused in one sentence. Returns how many are translated."""
+    rng, done = np.random.default_rng(seed), 0
+    base = [
+        "// a lobe\n#define SQ(x) ((x) * (x))\nconst float T[3] = {1.0, .5f, 2};\nstruct P { float a; };\n"
+        "real ndf_mine_D(real cos_m, real sin2_m, in float alpha) {\n  struct P p = {1}; int i = int(cos_m * 2.0);\n"
+        "  if (i > 1) { return SQ(T[i]); }\n  for (int k = 0; k < 3; k++) p.a += T[k] * vec3(1, 2, 3).b;\n"
+        "  return mix(p.a, 1, alpha); /* end */\n}\n",
+        "#version 330\n#if 1\nvec3 helper(vec3 h) { return h.rgb * 2.0; }\n#endif\n"
+        "vec3 brdf_mine_f(vec3 l, vec3 v, float k) { vec3 h = normalize(l + v); "
+        "return helper(h) * max(h.z, 0.0) * k; }\n",
+    ]
+    for n in range(count):
+        text = broken(rng, base[n % 2])
+        try:
+            made = user_model(("ndf", "brdf")[n % 2], write(text)).text
+        except (InputError, FileError) as error:
+            assert "\n" not in str(error) and "mine.clh" in str(error), (seed, n, text)
+        else:
+            assert made is not None and made.count("\n") >= text.count("\n") - text.count("\\\n"), (seed, n, text)
+            done += 1
+    return done
+
+
+def test_a_thousand_broken_texts_are_one_sentence_each(write: WriteFile) -> None:
+    assert 50 < translated(write, 1000, 21) < 950  # both ends are seen
+
+
+@pytest.mark.long
+def test_ten_thousand_broken_texts(write: WriteFile) -> None:
+    assert 500 < translated(write, 10_000, 22) < 9_500
+
+
+def test_long_texts_are_translated_in_proportion_to_their_length(write: WriteFile) -> None:
+    """Texts of some hundred kilobytes, for which any quadratic step would take minutes."""
+    many = "\n".join(
+        f"float f{k}(float x) {{ float a = 1, b = 2, c = max(x, a), d; return x * {k}.0; }}" for k in range(4000)
+    )
+    assert (
+        len(user_model("ndf", write(many + "\nfloat ndf_mine_D(float cos_m) { return f1(cos_m); }")).text or "") > 3e5
+    )
+    deep = "{" * 3000 + "}" * 3000 + ", a" * 20000
+    with pytest.raises(InputError):
+        user_model("ndf", write("float x = 1" + deep + ";\n"))

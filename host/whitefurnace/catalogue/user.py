@@ -20,7 +20,7 @@ CONSTANTS = ("per_norm", "lobe_width")
 
 _TAKEN = (*CONSTANTS, "area_scale", "area_per_range", "area_grazing", "area_terms")
 
-_INCLUDE = re.compile(r"^[ \t]*#[ \t]*include\b[ \t]*(.*?)[ \t]*(?://.*)?$", re.MULTILINE)
+_INCLUDE = re.compile(r"^[ \t]*#[ \t]*include\b([^\n]*)", re.MULTILINE)
 
 MOST_BYTES = 1 << 20
 """Largest size of a .clh file in bytes; the longest model of the catalogue has six thousand."""
@@ -95,7 +95,7 @@ def _with_includes(path: Path, folder: Path, files: list[Path], within: tuple[Pa
     text = _read(path)
     files.append(path)
     bare = re.sub(
-        r"//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\\n])*\"",
+        r"//[^\n]*|/\*(?:.*?\*/|.*)|\"(?:\\.|[^\"\\\n])*\"",
         lambda m: m[0] if m[0][0] == '"' else re.sub(r"[^\n]", " ", m[0]),
         text,
         flags=re.DOTALL,
@@ -103,7 +103,7 @@ def _with_includes(path: Path, folder: Path, files: list[Path], within: tuple[Pa
     pieces, end = [], 0
     for found in _INCLUDE.finditer(bare):
         line = bare.count("\n", 0, found.start()) + 1
-        quoted = re.fullmatch(r'"([^"]+)"', found[1])
+        quoted = re.fullmatch(r'"([^"]+)"', found[1].strip())
         if quoted is None:
             raise InputError(f'{path}:{line}: #include takes a file beside this one, as #include "NAME.clh"')
         there = path.parent / quoted[1]

@@ -99,6 +99,14 @@ class Token:
 _END = Token("end", "", 0)
 
 
+@dataclass
+class _Level:
+    """What is known of a statement within its brackets: whether it declares variables, or names a type."""
+
+    declares: bool = False
+    names_type: bool = False
+
+
 def decoded(raw: bytes, where: str) -> str:
     """Return the text of a file with plain line ends and without a byte-order mark; InputError where it is no text."""
     coding = "utf-16" if raw.startswith((b"\xff\xfe", b"\xfe\xff")) else "utf-8-sig"
@@ -182,8 +190,7 @@ class UserText:
         self._types = set(_TYPES)
         self._functions: set[str] = set()
         self._variables: set[str] = set()
-        for n in range(len(self._solid)):
-            self._declare(n)
+        self._note_declarations()
 
     def _at(self, n: int) -> Token:
         """The n-th token that is no space, or one of the kind "end" outside the text."""
@@ -191,47 +198,40 @@ class UserText:
 
     # ------------------------------------------------------------------------------------------ what it declares
 
-    def _declare(self, n: int) -> None:
-        """Note the name that the n-th token declares, if it does: a function, macro, variable or type."""
+    def _note_declarations(self) -> None:
+        """Note the names that the file declares: functions and macros, variables, and types."""
+        levels = [_Level()]
+        for n, token in enumerate(self._solid):
+            level, before = levels[-1], self._at(n - 1)
+            if token.directive:
+                if before.text == "define" and token.kind == "name":
+                    self._functions.add(token.text)
+                    self._variables.add(token.text)
+            elif token.text in ("(", "[", "{"):
+                levels.append(_Level())
+            elif token.text in (")", "]", "}"):
+                levels.pop()
+            elif token.text == ";":
+                if level.names_type and before.kind == "name":
+                    self._types.add(before.text)
+                    self._variables.add(before.text)
+                levels[-1] = _Level()
+            elif token.text == "typedef":
+                level.names_type = True
+            elif token.kind == "name" and token.text not in _KEYWORDS and token.text not in _TYPES:
+                self._note_name(n, level)
+
+    def _note_name(self, n: int, level: _Level) -> None:
+        """Note the name that is the n-th token, where it is declared there."""
         token, before, after = self._at(n), self._at(n - 1), self._at(n + 1)
-        if token.kind != "name" or token.text in _KEYWORDS or token.text in _TYPES:
-            return
-        if before.text == "define":
-            self._functions.add(token.text)
-            self._variables.add(token.text)
-        elif before.text in ("struct", "union", "enum") or (
-            after.text == ";" and any(t.text == "typedef" for t in self._statement(n))
-        ):
+        if before.text in ("struct", "union", "enum"):
             self._types.add(token.text)
             self._variables.add(token.text)
         elif before.text in self._types or (before.text == "*" and self._at(n - 2).text in self._types):
-            (self._functions if after.text == "(" else self._variables).add(token.text)
-        elif before.text == "," and not token.directive and self._in_declaration(n):
+            level.declares = after.text != "("
+            (self._variables if level.declares else self._functions).add(token.text)
+        elif before.text == "," and level.declares:
             self._variables.add(token.text)
-
-    def _statement(self, n: int) -> Iterator[Token]:
-        """The tokens before the n-th back to the end of the statement before, at the depth of the n-th or deeper."""
-        depth = self._at(n).depth
-        while (n := n - 1) >= 0:
-            token = self._at(n)
-            if token.depth < depth or (token.depth == depth and token.text in (";", "{") and depth) or token.directive:
-                return
-            if token.depth == depth and token.text == ";":
-                return
-            yield token
-
-    def _in_declaration(self, n: int) -> bool:
-        """Whether the n-th token, after a comma, is a further name in a declaration such as `float a = f(x, y), b;`."""
-        level = 0
-        before = list(self._statement(n))
-        for token in before:
-            level += {")": 1, "]": 1, "}": 1, "(": -1, "[": -1, "{": -1}.get(token.text, 0)
-            if level < 0:
-                return False  # the comma separates arguments or elements
-        words = [token.text for token in reversed(before)]
-        while words and words[0] in ("const", "constant", "__constant", "static", "for", "("):
-            words.pop(0)
-        return len(words) > 1 and words[0] in self._types and words[1] not in ("(", ")")
 
     def signatures(self) -> dict[str, Signature]:
         """The functions that the file defines, by name."""
@@ -240,9 +240,9 @@ class UserText:
             if token.kind != "name" or token.depth or token.directive or self._at(n + 1).text != "(":
                 continue
             close = n + 2
-            while self._at(close).kind != "end" and self._at(close).text != ")":
+            while self._at(close).kind == "name" or self._at(close).text in (",", "*"):
                 close += 1
-            if self._at(close + 1).text == "{":
+            if self._at(close).text == ")" and self._at(close + 1).text == "{":
                 inside = self._solid[n + 2 : close]
                 found[token.text] = Signature(
                     token.text, self._at(n - 1).text, tuple(self._parameters(inside)), token.line
