@@ -228,6 +228,18 @@ def test_other_ways_in_constant_light(device, tmp_path):
     assert np.allclose(matte.integrals.grooved(), rest * want, atol=2e-4)
 
 
+@pytest.mark.parametrize("masking", ["ashikhmin", "estevez_kulla"])
+def test_the_split_sum_of_a_sheen_is_exact_in_constant_light(device, tmp_path, masking):
+    """Every lobe's mean of constant light is that light, whatever the masking; in other light it is not."""
+    cloth = plain(WHITE, 0, 0.8, sheen={"sheenColorFactor": [1, 1, 1], "sheenRoughnessFactor": 0.6})
+    scene, off = scene_of(tmp_path, cloth), {}
+    for name, env in (("constant", environment(np.ones((16, 32, 3), np.float32))), ("lobed", lobed())):
+        found = ErrorMeter(scene, env, ENGINES["filament"], device, count=24).integrals.sheen(masking)
+        off[name] = 0.0 if found is None else float(np.abs(found).max())
+    # Sums of float32 over 10⁴ terms.
+    assert off["constant"] <= 1e-4 and off["lobed"] > 1e-2
+
+
 def test_lobes_are_those_of_the_prefilter(meter, device):
     """By sums over all texels (`reading.Exact`), which share no code with the samples here."""
     exact = Exact(device, meter.env, usual(ENGINES["filament"]))

@@ -44,6 +44,11 @@ def test_an_entry_is_refused_in_another_slot(entry: Model) -> None:
     assert chosen(entry.slot, entry).model is entry
 
 
+@EVERY
+def test_a_masking_is_made_for_an_ndf_that_there_is(entry: Model) -> None:
+    assert entry.made_for == "" or (entry.slot == "masking" and entry.made_for in models("ndf"))
+
+
 def test_a_paper_is_listed_once() -> None:
     """Papers of entries are not in the list of shared ones, and an entry takes another's paper from that entry."""
     brought: dict[str, Paper] = {}

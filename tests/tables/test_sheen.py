@@ -131,6 +131,7 @@ def test_bakes_write_the_third_channel_too(device: Device, tmp_path: Path) -> No
     rgbd = unpack("rgbd", code, code.shape[:-1])
     for name, table in (("filament", halves), ("babylon", rgbd)):
         entry = next(e for file, e in made.manifest["files"].items() if f"{name}/array_dfg" in file)
+        assert entry["charlie_masking"] == "ashikhmin"
         for (row, column), want in third_channel(len(table)).items():
             # Half an ulp of half; half a step of a code of 8 bits to the power of 2.2, which the bake states.
             allowed = 2.0**-11 * max(want, 2.0**-14) if name == "filament" else 0.02 * want + 1e-4

@@ -337,7 +337,7 @@ class ErrorMeter:
                 used=False,
             )
             for name in models("masking")
-            if name != "smith"
+            if name != "smith" and models("masking")[name].made_for in ("", "ggx")  # which these lobes are
         ]
         masking = self.reads.engine.dfg.charlie_masking
         if (sheen := integrals.sheen(masking)) is not None:

@@ -403,10 +403,10 @@ class _Deciding:
             left = "" if self.sheens else ", so the table's third channel is left out"
             self.rows.append(Need("Charlie's albedo in the table", "table", bool(self.sheens), text + left))
         elif self.sheens and engine.container == "files":
-            table = "table has no channel" if engine.holding("dfg") else "files have no table"
-            self.rows.append(
-                Need("Charlie's albedo in the table", "table", None, f"{text}, and the {table} for it in {engine.name}")
-            )
+            lacks = f"the table of {engine.name} has no channel for it"
+            if not engine.holding("dfg"):
+                lacks = f"the files for {engine.name} have no table of it"
+            self.rows.append(Need("Charlie's albedo in the table", "table", None, f"{text}, and {lacks}"))
 
     def _tables(self) -> Iterator[dict[str, Any]]:
         """Options of `lut` for tables that the engine does not have, for users' own renderers."""

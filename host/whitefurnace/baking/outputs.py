@@ -486,7 +486,11 @@ def _dfg(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
         "size": n,
         "error": made.split.error,
         "rule": made.split.rule,
-        **({"charlie_error": made.split.charlie_error} if engine.dfg.charlie else {}),
+        **(
+            {"charlie_error": made.split.charlie_error, "charlie_masking": engine.dfg.charlie_masking}
+            if engine.dfg.charlie
+            else {}
+        ),
     }
     if file.suffix == ".exr":
         return Encoded(

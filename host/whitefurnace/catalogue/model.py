@@ -108,6 +108,7 @@ class Model:
     provides, needs: kernel functions that it has, and those of other slots that it calls, as SLOT_FUNCTION (`NDF_D`).
     reference: float64 references by function name, written in another form than the kernel.
     isotropic: True if an NDF depends on the polar angle alone.
+    made_for: name of the NDF that a masking is made for; "" for any. It can be combined with the others all the same.
     from_roughness: function from a perceptual roughness in [0, 1] to its parameters, for a chain of levels.
     past_one: the same for a roughness over 1, which the last mips of some engines have; None where r = 1 is the end.
     checks: facts that the engine and the tests act on. notes: further facts, in prose, for readers alone.
@@ -130,6 +131,7 @@ class Model:
     reference: Mapping[str, Callable[..., Any]]
     needs: tuple[str, ...] = ()
     isotropic: bool = True
+    made_for: str = ""
     from_roughness: Callable[[float], dict[str, float]] | None = None
     past_one: Callable[[float], dict[str, float]] | None = None
     checks: Checks = Checks()

@@ -33,6 +33,7 @@ ENTRY = Model(
         Paper("Ashikhmin2007", "M. Ashikhmin, S. Premože, Distribution-based BRDFs, University of Utah, 2007"),
     ),
     parameters=(),
+    made_for="charlie",
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
     checks=Checks(reciprocal=True),

@@ -76,6 +76,7 @@ ENTRY = Model(
     ),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
+    made_for="charlie",
     from_roughness=lambda r: {"alpha": r * r},
     # Rounding of log Λ, which is up to 61, is a relative error of Λ.
     checks=Checks(
