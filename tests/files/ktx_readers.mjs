@@ -3,6 +3,7 @@
 // format that its cubes have, which libktx refuses). One line of JSON a file and reader.
 //
 //   node ktx_readers.mjs FOLDER_OF_NODE_MODULES FILE...
+//   node ktx_readers.mjs FOLDER_OF_NODE_MODULES --names        ktx-parse's numbers of Vulkan's formats
 import { createHash } from "node:crypto";
 import { readFileSync } from "node:fs";
 import { createRequire } from "node:module";
@@ -29,7 +30,8 @@ function recorder(uploads) {
   let alignment = 4;
   const keep = (kind, target, level, width, height, layers, format, type, data, offset, length) => {
     // Without a length the data is all of the library's memory from there on.
-    const texel = { 0x140b: 2, 0x1406: 4 }[type] * { 0x8227: 2, 0x1907: 3, 0x1908: 4 }[format] || 4;
+    const texel = { 0x1401: 1, 0x1403: 2, 0x140b: 2, 0x1406: 4 }[type]
+                  * { 0x1903: 1, 0x8227: 2, 0x1907: 3, 0x1908: 4 }[format] || 4;
     const row = Math.ceil((width * texel) / alignment) * alignment;
     const bytes = new Uint8Array(data.buffer, data.byteOffset + offset * data.BYTES_PER_ELEMENT,
                                  length ?? row * height * layers);
@@ -85,7 +87,13 @@ function bundled(filament, bytes) {
   };
 }
 
-const { read } = await import(pathToFileURL(path.join(modules, "ktx-parse/dist/index.mjs")));
+const parse = await import(pathToFileURL(path.join(modules, "ktx-parse/dist/index.mjs")));
+const { read } = parse;
+if (files[0] === "--names") {
+  const formats = Object.entries(parse).filter(([name]) => name.startsWith("VK_FORMAT_"));
+  console.log(JSON.stringify(Object.fromEntries(formats)));
+  process.exit(0);
+}
 const ktx = await wasm("@khronosgroup/gltf-viewer/dist/libs", "libktx", "LIBKTX");
 const filament = await wasm("filament", "filament", "Filament");
 for (const file of files) {

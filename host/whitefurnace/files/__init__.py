@@ -16,7 +16,7 @@ from whitefurnace.files.harmonics import read_sh
 from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
 from whitefurnace.files.image import Image, decode_srgb, read_image, srgb_table
 from whitefurnace.files.inputs import head_of, input_size, is_input, open_input, read_input, read_text
-from whitefurnace.files.lights import Light, is_light, light_digest, light_files, read_light, read_radiance
+from whitefurnace.files.lights import Deferred, Light, is_light, light_digest, light_files, read_light, read_radiance
 from whitefurnace.files.lock import Lock, acquire, is_lock, is_safe, lock_path, locks_in
 from whitefurnace.files.manifest import read_manifest, write_manifest
 from whitefurnace.files.npy import release, scratch, write_npy
@@ -29,6 +29,7 @@ from whitefurnace.files.tables import Stored, check_table, identifier, number, s
 from whitefurnace.files.texture import Texture, text_value
 
 __all__ = [
+    "Deferred",
     "EnvMap",
     "FileOutput",
     "FolderOutput",

@@ -82,8 +82,11 @@ def pack_key_values(pairs: Mapping[str, bytes]) -> bytes:
     return bytes(out)
 
 
-def parse_key_values(source: Source, offset: int, length: int) -> dict[str, bytes]:
-    """Parse the key-value data of KTX 1 and 2; values are returned as stored. Raises `InputError`."""
+def parse_key_values(source: Source, offset: int, length: int, order: str = "<") -> dict[str, bytes]:
+    """Parse the key-value data of KTX 1 and 2; values are returned as stored. Raises `InputError`.
+
+    order: "<" for little-endian sizes, ">" for big-endian ones.
+    """
     source.piece(offset, length, "its key-value data")
     pairs: dict[str, bytes] = {}
     end = offset + length
@@ -91,7 +94,7 @@ def parse_key_values(source: Source, offset: int, length: int) -> dict[str, byte
         what = f"the key-value pair at byte {offset}"
         if end - offset < 4:
             raise source.wrong(f"{what} has {end - offset} bytes, it needs 4 for its size")
-        (size,) = source.integers("I", offset, what)
+        (size,) = struct.unpack(f"{order}I", source.piece(offset, 4, what))
         if not 2 <= size <= end - offset - 4:
             raise source.wrong(f"{what} says that it has {size} bytes, between 2 and {end - offset - 4} can be there")
         key, nul, value = bytes(source.piece(offset + 4, size, what)).partition(b"\0")

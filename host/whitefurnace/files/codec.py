@@ -45,6 +45,14 @@ def require_encoder(form: str) -> None:
         library()
 
 
+def require_decoder(form: str) -> None:
+    """Check that this machine can read the pixel format `form`. Raises `UnsupportedError`, which names the extra."""
+    if form == ASTC:
+        from whitefurnace.files.astc import library
+
+        library()
+
+
 def encode(
     form: str,
     levels: Sequence[npt.ArrayLike],

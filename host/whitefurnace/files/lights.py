@@ -10,7 +10,7 @@ import json
 import math
 import os
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import unquote
@@ -22,7 +22,7 @@ from whitefurnace.errors import FileError, InputError, UnsupportedError
 from whitefurnace.files import ktx1, ktx2
 from whitefurnace.files.atomic import digest_file
 from whitefurnace.files.binary import Source, load
-from whitefurnace.files.codec import decode
+from whitefurnace.files.codec import decode, require_decoder
 from whitefurnace.files.containers import is_texture, parse_texture
 from whitefurnace.files.env import MAGIC as ENV_MAGIC
 from whitefurnace.files.env import parse_env
@@ -34,18 +34,31 @@ from whitefurnace.files.texture import Texture, upright
 Texels = npt.NDArray[np.float32]
 
 
+@dataclass(frozen=True, eq=False)
+class Deferred:
+    """Texels of a file that are decoded when they are asked for, and not kept: memory holds one level at a time.
+
+    shape  that of the array that `decode` returns
+    """
+
+    shape: tuple[int, ...]
+    decode: Callable[[], Texels]
+
+
 @dataclass(frozen=True)
 class Light:
     """The light in a file of a GPU container.
 
     container      title of the container; `format` the pixel format in words
     cube, layers   whether the texture is a cube; its number of layers, 0 where it is not an array
-    levels         decoded levels, float32 ([layers,] [6,] height, width, channels); cubes are GL-direct
+    levels         the levels, float32 ([layers,] [6,] height, width, channels); cubes are GL-direct
     stored         bytes of each level in the file; empty where the container does not state them
     largest        the largest finite value that each channel can hold
     facts, keys    facts of the header for display; key-values as texts, binary ones by their number of bytes
     undecoded      the reason where there are no levels because the package that decodes them is not installed
     roughness      perceptual roughness of each level, where the container fixes it
+    notices        sentences about what the file states and what was applied
+    said           sentences about values that a conversion changed, of the levels that have been decoded
     polynomials, irradiance, irradiance_sh   Babylon's (9, 3) and (6, n, n, 3), and glTF's (9, 3) without a scale
     """
 
@@ -53,7 +66,7 @@ class Light:
     format: str
     cube: bool
     layers: int
-    levels: tuple[Texels, ...]
+    levels: tuple[Texels | Deferred, ...]
     stored: tuple[int, ...]
     largest: tuple[float, ...]
     facts: Mapping[str, str | int] = field(default_factory=dict)
@@ -63,6 +76,8 @@ class Light:
     polynomials: npt.NDArray[np.float64] | None = None
     irradiance: Texels | None = None
     irradiance_sh: npt.NDArray[np.float64] | None = None
+    notices: tuple[str, ...] = ()
+    said: list[str] = field(default_factory=list)
 
 
 def is_light(path: str | os.PathLike[str]) -> bool:
@@ -80,10 +95,11 @@ def _kind(path: str | os.PathLike[str]) -> str | None:
     return "gltf" if head.startswith(GLB_MAGIC) or Path(path).suffix.lower() in (".gltf", ".glb") else None
 
 
-def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
-    """Read the light in a file; where `first` is True, only level 0 of a texture is decoded.
+def read_light(path: str | os.PathLike[str]) -> Light:
+    """Read the light in a file. The levels of a texture are decoded one at a time, when they are asked for.
 
-    Raises `FileError` for a file that cannot be read, and `InputError` for one that is not valid.
+    Raises `FileError` for a file that cannot be read, `InputError` for one that is not valid or needs more memory than
+    it may take, and `UnsupportedError` for one that is valid and not read.
     """
     kind = _kind(path)
     if kind == "env":
@@ -93,14 +109,13 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
     source = load(path)
     data = source.view
     texture = parse_texture(source)
-    levels: tuple[Texels, ...] = ()
+    said: list[str] = []
     undecoded = ""
     try:
-        levels = tuple(
-            upright(decode(texture, k), texture.orientation) for k in range(1 if first else len(texture.levels))
-        )
+        require_decoder(texture.format)
     except UnsupportedError as error:
         undecoded = str(error)
+    levels = () if undecoded else tuple(_deferred(texture, k, source.name, said) for k in range(len(texture.levels)))
     facts: dict[str, str | int] = {
         "width": texture.width,
         "height": texture.height,
@@ -109,7 +124,7 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
         "faces": texture.faces,
         "bytes": len(source),
     }
-    stored = tuple(memoryview(level).nbytes for level in texture.levels)
+    stored = tuple(texture.level_bytes(k) for k in range(len(texture.levels)))
     container = "DDS"
     if bytes(data[:12]) == ktx2.IDENTIFIER:
         container = "KTX 2"
@@ -119,8 +134,9 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
     elif bytes(data[:12]) == ktx1.IDENTIFIER:
         container = "KTX 1"
         # Filament's loader accepts 0x8C3A as type and format too, where GL has 0x8C3B and RGB.
+        order = "<" if data[12] == 1 else ">"
         facts["glType"], _, facts["glFormat"], facts["glInternalFormat"] = (
-            f"{code:#06x}" for code in struct.unpack_from("<4I", data, 16)
+            f"{code:#06x}" for code in struct.unpack_from(f"{order}4I", data, 16)
         )
     if texture.orientation != "rd":
         facts["orientation"] = texture.orientation
@@ -129,31 +145,53 @@ def read_light(path: str | os.PathLike[str], *, first: bool = False) -> Light:
         container,
         title,
         texture.cube,
-        texture.layers,
+        texture.layers if texture.layers > 1 else 0,
         levels,
         stored,
         _largest(texture),
         facts,
         {key: _text(value) for key, value in texture.key_values.items()},
         undecoded=undecoded,
+        notices=texture.notices,
+        said=said,
     )
 
 
-def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool]:
-    """Read level 0 as radiance: (6, n, n, 3 | 4) and True for a cube, (h, w, 3 | 4) and False for an image.
+def _deferred(texture: Texture, k: int, name: str, said: list[str]) -> Deferred:
+    """Return level k of a texture, to be decoded upright and as light. An array of one layer is a single texture.
 
-    Raises the errors of `read_light`, `InputError` for arrays and for other numbers of channels, and
-    `UnsupportedError` where the package that decodes the format is not installed.
+    said: receives sentences when the level is decoded.
     """
-    light = read_light(path, first=True)
+    width, height = texture.extent(k)
+    layers = texture.layers if texture.layers > 1 else 0
+
+    def decoded() -> Texels:
+        texels = upright(decode(texture, k), texture.orientation)
+        texels = texture.meaning.as_light(texels, name, said)
+        return texels if layers or not texture.layers else texels[0]
+
+    shape = (*([layers] if layers else []), *([6] if texture.cube else []), height, width)
+    return Deferred((*shape, texture.meaning.channels(FORMATS[texture.format].channels)), decoded)
+
+
+def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool, tuple[str, ...]]:
+    """Read level 0 as radiance: (6, n, n, 1 | 3 | 4) and True for a cube, (h, w, 1 | 3 | 4) and False for an image.
+
+    The third value holds sentences about what the file states and what was applied. Raises the errors of `read_light`,
+    `InputError` for arrays and for textures of two channels, and `UnsupportedError` where the package that decodes the
+    format is not installed.
+    """
+    light = read_light(path)
     if light.layers:
         many = "cubes" if light.cube else "images"
         raise InputError(f"{path} is an array of {light.layers} {many}, a single cube or 2-D image was expected")
     if light.undecoded:
         raise UnsupportedError(f"{path} is of {light.format}: {light.undecoded}")
-    if light.levels[0].shape[-1] not in (3, 4):
-        raise InputError(f"{path} has {light.levels[0].shape[-1]} channels ({light.format}), 3 or 4 were expected")
-    return np.ascontiguousarray(light.levels[0]), light.cube
+    first = light.levels[0]
+    if first.shape[-1] not in (1, 3, 4):
+        raise InputError(f"{path} has {first.shape[-1]} channels ({light.format}), 1, 3 or 4 were expected")
+    texels = first.decode() if isinstance(first, Deferred) else first
+    return np.ascontiguousarray(texels), light.cube, (*light.notices, *light.said)
 
 
 def _env(source: Source) -> Light:

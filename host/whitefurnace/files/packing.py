@@ -6,7 +6,7 @@ Values are rounded to the nearest code and never to inf. `step` bounds the error
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -32,6 +32,7 @@ class Format:
     largest   the largest finite value (for `b10g11r11` of red and green)
     signed    whether negative values can be stored
     block     texels per side of a block; 1 where the format is not compressed
+    kind      "float", or "whole" for integers that stand for 0 to 1, or "srgb" for those with the curve of sRGB
     """
 
     name: str
@@ -41,15 +42,29 @@ class Format:
     largest: float
     signed: bool = False
     block: int = 1
+    kind: str = "float"
+
+
+def _number_formats() -> Iterator[Format]:
+    """Yield the formats of one to four numbers of one type."""
+    words = ("one", "two", "three", "four")
+    for count, letters in enumerate(("r", "rg", "rgb", "rgba"), 1):
+        many = f"{words[count - 1]} %s-bit %s{'s' if count > 1 else ''}"
+        yield Format(f"{letters}16f", many % (16, "float"), count, 2 * count, 65504.0, signed=True)
+        largest = float(np.finfo(np.float32).max)
+        yield Format(f"{letters}32f", many % (32, "float"), count, 4 * count, largest, signed=True)
+        for bits in (8, 16):
+            title = f"{many % (bits, 'integer')} for 0 to 1"
+            yield Format(f"{letters}{bits}", title, count, bits // 8 * count, 1.0, kind="whole")
+    for count, letters in ((3, "rgb"), (4, "rgba")):
+        title = f"{words[count - 1]} 8-bit integers, colours in sRGB"
+        yield Format(f"{letters}8srgb", title, count, count, 1.0, kind="srgb")
 
 
 FORMATS: Mapping[str, Format] = {
     entry.name: entry
     for entry in (
-        Format("rg16f", "two 16-bit floats", 2, 4, 65504.0, signed=True),
-        Format("rgb16f", "three 16-bit floats", 3, 6, 65504.0, signed=True),
-        Format("rgba16f", "four 16-bit floats", 4, 8, 65504.0, signed=True),
-        Format("rgba32f", "four 32-bit floats", 4, 16, float(np.finfo(np.float32).max), signed=True),
+        *_number_formats(),
         # GL 4.6 core, 8.5.2: 511/512 · 2^(31-15)
         Format("rgb9e5", "9-bit mantissas with one 5-bit exponent", 3, 4, 65408.0),
         # GL 4.6 core, 2.3.4.3 and 2.3.4.4: (1 + 63/64)·2^15; blue, of 10 bits, ends at (1 + 31/32)·2^15 = 64512
@@ -114,10 +129,10 @@ def pack(name: str, values: npt.ArrayLike) -> Packed:
             if count := int(np.count_nonzero(below)):
                 negative += count
                 part = np.where(below, 0, part)
+        if given < kind.channels:
+            part = np.concatenate([part, np.ones_like(part[:, :1])], axis=1)
         codes, over = _ENCODERS[name](part)
         clipped += over
-        if given < kind.channels:
-            codes = np.concatenate([codes, np.ones_like(codes[:, :1])], axis=1)
         data[start : start + len(part)] = np.ascontiguousarray(codes).view(np.uint8).reshape(len(part), kind.size)
     return Packed(data.reshape(*array.shape[:-1], kind.size), clipped, negative)
 
@@ -363,16 +378,67 @@ def _step_rgbd(values: Floats) -> tuple[Floats, Floats]:
     return half + np.spacing(np.float32(255.0)) * values / 255.0, np.broadcast_to(scale, values.shape)
 
 
+# --- integers for 0 to 1 [GL 4.6 core, 2.3.5], with the curve of sRGB [8.24] or without ---------------------
+
+
+@cache
+def _whole_table(bits: int, srgb: bool) -> Floats:
+    """Return the value of every code, rising."""
+    codes = np.arange(1 << bits) / ((1 << bits) - 1.0)
+    if not srgb:
+        return codes
+    return np.where(codes <= 0.04045, codes / 12.92, ((codes + 0.055) / 1.055) ** 2.4)
+
+
+def _curves(channels: int, bits: int, srgb: bool) -> list[Floats]:
+    """Return the table of each channel; alpha has no curve."""
+    return [_whole_table(bits, srgb and c < 3) for c in range(channels)]
+
+
+def _encode_whole(bits: int, srgb: bool, values: npt.NDArray[Any]) -> tuple[Codes, int]:
+    """Encode integers; the codes are the nearest in decoded values, ties go to the even one."""
+    codes = np.empty(values.shape, f"<u{bits // 8}")
+    clipped = 0
+    for c, table in enumerate(_curves(values.shape[1], bits, srgb)):
+        x = values[:, c].astype(np.float64)
+        clipped += int(np.count_nonzero(x >= 1.0 + (table[-1] - table[-2]) / 2))
+        x = np.minimum(x, 1.0)
+        below = np.clip(np.searchsorted(table, x, side="right") - 1, 0, len(table) - 2)
+        excess = (x - table[below]) - (table[below + 1] - x)
+        codes[:, c] = below + ((excess > 0) | ((excess == 0) & (below & 1 == 1)))
+    return codes, clipped
+
+
+def _decode_whole(bits: int, srgb: bool, raw: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    codes = np.ascontiguousarray(raw).view(f"<u{bits // 8}")
+    tables = _curves(codes.shape[1], bits, srgb)
+    return np.stack([table.astype(np.float32)[codes[:, c]] for c, table in enumerate(tables)], axis=1)
+
+
+def _step_whole(bits: int, srgb: bool, values: Floats) -> tuple[Floats, float]:
+    halves = []
+    for c, table in enumerate(_curves(values.shape[-1], bits, srgb)):
+        below = np.clip(np.searchsorted(table, values[..., c], side="right") - 1, 0, len(table) - 2)
+        halves.append((table[below + 1] - table[below]) / 2)
+    # The second term is the rounding of the decoded float32.
+    return np.stack(halves, axis=-1) + np.spacing(np.float32(1.0)) / 2 * np.minimum(values, 1.0), 1.0
+
+
+def _whole(bits: int, srgb: bool = False) -> tuple[Callable[[Any], Any], Callable[[Any], Any], Callable[[Any], Any]]:
+    return (
+        lambda v: _encode_whole(bits, srgb, v),
+        lambda raw: _decode_whole(bits, srgb, raw),
+        lambda v: _step_whole(bits, srgb, v),
+    )
+
+
 def _float(dtype: str) -> tuple[Callable[[Any], Any], Callable[[Any], Any], Callable[[Any], Any]]:
     return (lambda v: _encode_float(dtype, v), lambda raw: _decode_float(dtype, raw), lambda v: _step_float(dtype, v))
 
 
-_HALF, _SINGLE = _float("<f2"), _float("<f4")
+_TYPES = {"16f": _float("<f2"), "32f": _float("<f4"), "8": _whole(8), "16": _whole(16), "8srgb": _whole(8, True)}
 _CODECS: dict[str, tuple[Callable[[Any], Any], Callable[[Any], Any], Callable[[Any], Any]]] = {
-    "rg16f": _HALF,
-    "rgb16f": _HALF,
-    "rgba16f": _HALF,
-    "rgba32f": _SINGLE,
+    **{entry.name: _TYPES[entry.name.lstrip("rgba")] for entry in _number_formats()},
     "rgb9e5": (_encode_shared, _decode_shared, _step_shared),
     "b10g11r11": (_encode_small, _decode_small, _step_small),
     "rgbd": (_encode_rgbd, _decode_rgbd, _step_rgbd),

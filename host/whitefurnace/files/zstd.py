@@ -1,9 +1,11 @@
-"""Compresses and decompresses with Zstandard. A frame is never unpacked to more bytes than the caller expects.
+"""Compresses with Zstandard; unpacks Zstandard and ZLIB, never to more bytes than the caller expects.
 
 Only this module imports `zstandard`.
 """
 
 from __future__ import annotations
+
+import zlib
 
 from whitefurnace.files.binary import Buffer, Source
 
@@ -52,4 +54,39 @@ def decompress(data: Buffer, size: int, source: Source, what: str) -> bytearray:
     if len(out) != size:
         more = "more than " if len(out) > size else ""
         raise source.wrong(f"{what} unpacks to {more}{min(len(out), size)} bytes, its level has {size}")
+    return out
+
+
+DEFLATE_RATIO = 1032
+"""Deflate packs at most 258 bytes into two bits [RFC 1951, 3.2.5]."""
+
+
+def inflate(data: Buffer, size: int, source: Source, what: str) -> bytearray:
+    """Unpack the ZLIB stream `data`, which must hold exactly `size` bytes and an end.
+
+    Memory grows with the output, piece by piece, to no more than `size`. Raises `InputError`, which names `what` of
+    `source`.
+    """
+    if size > len(data) * DEFLATE_RATIO:
+        raise source.wrong(f"{what} cannot hold {size} bytes in {len(data)}, ZLIB packs at most 1 : {DEFLATE_RATIO}")
+    unpacker, out, at = zlib.decompressobj(), bytearray(), 0
+    try:
+        for at in range(0, len(data), _PIECE):
+            left, full = bytes(data[at : at + _PIECE]), True
+            while full and not unpacker.eof and len(out) <= size:
+                room = min(_PIECE, size + 1 - len(out))
+                piece = unpacker.decompress(left, room)
+                out += piece
+                left = unpacker.unconsumed_tail
+                full = bool(left) or len(piece) == room  # there may be more without further input
+            if unpacker.eof or len(out) > size:
+                break
+    except zlib.error as error:
+        raise source.wrong(f"{what} cannot be unpacked by ZLIB ({error})") from error
+    if len(out) != size or not unpacker.eof:
+        beyond = "more than " if len(out) > size else ""
+        end = "" if unpacker.eof or len(out) > size else " and an end"
+        raise source.wrong(f"{what} unpacks to {beyond}{min(len(out), size)} bytes, its level has {size}{end}")
+    if unused := len(unpacker.unused_data) + max(len(data) - at - _PIECE, 0):
+        raise source.wrong(f"{what} has {unused} bytes after the end of its ZLIB stream")
     return out

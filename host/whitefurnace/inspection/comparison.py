@@ -14,6 +14,7 @@ import numpy as np
 
 from whitefurnace.engines.presets import ENGINES, axes_matrix
 from whitefurnace.errors import UnsupportedError
+from whitefurnace.files import Deferred
 from whitefurnace.inspection.contents import Contents, Level
 from whitefurnace.prefiltering.certificate import texel_errors
 from whitefurnace.prefiltering.reading import bilinear
@@ -142,7 +143,7 @@ def _is_sphere(found: Contents) -> bool:
 
 
 def _levels(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
-    layers = {found.levels[0].texels.shape[0] if found.kind == "cube array" else 0 for found in (a, b)}
+    layers = {found.levels[0].shape[0] if found.kind == "cube array" else 0 for found in (a, b)}
     if len(layers) > 1:
         raise UnsupportedError(
             f"{a.path} is a {a.kind} and {b.path} a {b.kind}: an array can be compared only with an array "
@@ -155,7 +156,7 @@ def _levels(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
             shown.append((one, other))
             continue
         for k, (first, second) in enumerate(zip(one.texels, other.texels, strict=True)):
-            pair = replace(one, texels=first), replace(other, texels=second)
+            pair = replace(one, held=first), replace(other, held=second)
             yield _sphere(f"{other.name} of layer {k}", *pair, notices)
             shown.append(pair)
     notices += _symmetry(shown)
@@ -166,7 +167,7 @@ def _matched(a: Contents, b: Contents, notices: list[str]) -> list[tuple[Level, 
     found: list[tuple[Level, Level]] = []
     free = list(a.levels)
     for other in b.levels:
-        alike = [one for one in free if one.texels.shape[:-1] == other.texels.shape[:-1]]
+        alike = [one for one in free if one.shape[:-1] == other.shape[:-1]]
         known = [one for one in alike if one.roughness is not None and other.roughness is not None]
         same = [one for one in known if _same(one, other)]
         pick = same or [one for one in alike if one not in known]
@@ -209,7 +210,7 @@ def _same(one: Level, other: Level) -> bool:
 
 
 def _size(level: Level) -> str:
-    shape = level.texels.shape
+    shape = level.shape
     return f"{level.size}²" if len(shape) >= 4 else f"{shape[1]}×{shape[0]}"
 
 
@@ -284,7 +285,7 @@ def _sphere(part: str, one: Level, other: Level, notices: list[str]) -> Row:
 
 
 def _named(level: Level) -> str:
-    return f"a {'cube' if level.texels.ndim == 4 else 'lat-long'} of {_size(level)}"
+    return f"a {'cube' if len(level.shape) == 4 else 'lat-long'} of {_size(level)}"
 
 
 def _angles(latlong: bool, dims: Sequence[int]) -> np.ndarray:
@@ -364,11 +365,7 @@ def _read_latlong(texels: np.ndarray, d: np.ndarray) -> np.ndarray:
 
 def _symmetry(pairs: Sequence[tuple[Level, Level]]) -> list[str]:
     """Return a notice where A's cube agrees far better after a turn or a reflection; else an empty list."""
-    alike = [
-        (one, other)
-        for one, other in pairs
-        if one.texels.ndim == 4 and one.texels.shape == other.texels.shape and one.size > 1
-    ]
+    alike = [(one, other) for one, other in pairs if len(one.shape) == 4 and one.shape == other.shape and one.size > 1]
     if not alike:
         return []
     one, other = min(alike, key=lambda pair: abs(pair[0].size - 32))
@@ -438,10 +435,14 @@ def _turned(found: Contents, axes: np.ndarray) -> Contents:
     """Turn contents from `axes` to ours. Raises UnsupportedError for contents without directions."""
     if not _is_sphere(found) and found.levels:
         raise UnsupportedError(f"{found.path} holds {found.kind}, and only cubes and lat-longs have axes")
-    levels = tuple(replace(level, texels=_along(level.texels, axes, found)) for level in found.levels)
-    irradiance = found.irradiance and replace(found.irradiance, texels=_along(found.irradiance.texels, axes, found))
+    levels = tuple(_turned_level(level, axes, found) for level in found.levels)
+    irradiance = found.irradiance and _turned_level(found.irradiance, axes, found)
     sh = None if found.sh is None else turned(found.sh, axes.T)
     return replace(found, levels=levels, irradiance=irradiance, sh=sh)
+
+
+def _turned_level(level: Level, axes: np.ndarray, found: Contents) -> Level:
+    return replace(level, held=Deferred(level.shape, lambda: _along(level.texels, axes, found)))
 
 
 def _along(texels: np.ndarray, axes: np.ndarray, found: Contents) -> np.ndarray:
@@ -471,9 +472,9 @@ def _tables(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
         if a.kind == b.kind == "arrays"
         else list(zip(a.levels, b.levels, strict=False))
     )
-    alike = [(one, other) for one, other in pairs if one.texels.shape[:-1] == other.texels.shape[:-1]]
+    alike = [(one, other) for one, other in pairs if one.shape[:-1] == other.shape[:-1]]
     if not alike:
-        shapes = (" × ".join(map(str, found.levels[0].texels.shape[:-1])) for found in (a, b))
+        shapes = (" × ".join(map(str, found.levels[0].shape[:-1])) for found in (a, b))
         raise UnsupportedError(
             f"{a.path} and {b.path} are tables of {' and '.join(shapes)} texels; "
             "only tables of the same size can be compared"
@@ -535,5 +536,5 @@ def _others(a: Contents, b: Contents, notices: list[str]) -> Iterator[Row]:
             None,
             f"{names[int(k)]} of {'RGB'[int(c)]}" if worst > 0 else "",
         )
-    if a.dfg is not None and b.dfg is not None and a.dfg.texels.shape[:-1] == b.dfg.texels.shape[:-1]:
+    if a.dfg is not None and b.dfg is not None and a.dfg.shape[:-1] == b.dfg.shape[:-1]:
         yield from _table("dfg", a.dfg, b.dfg, notices)

@@ -18,6 +18,7 @@ import numpy as np
 from whitefurnace.engines.presets import ENGINES, HOLDS, Engine, File, axes_matrix
 from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import (
+    Deferred,
     Light,
     digest_file,
     image_facts,
@@ -54,22 +55,35 @@ TITLES = {"openexr": "OpenEXR", "hdr": "Radiance HDR", "png": "PNG", "tiff": "TI
 class Level:
     """One mip level, table or array.
 
-    texels     float32: (6, n, n, c) or (h, w, c); arrays of either have one more axis in front
+    held       the texels, or `Deferred` ones, which are decoded anew each time that they are asked for
     roughness  perceptual roughness, where the file or its manifest states it
     stored     bytes in the file, where the level has bytes of its own
     stated     errors that this tool stated for it, by their names in FIGURES
     """
 
     name: str
-    texels: np.ndarray
+    held: np.ndarray | Deferred
     roughness: float | None = None
     stored: int | None = None
     stated: Mapping[str, float] = field(default_factory=dict)
 
     @property
+    def texels(self) -> np.ndarray:
+        """The texels, float32: (6, n, n, c) or (h, w, c); arrays of either have one more axis in front.
+
+        Raises InputError where the level of a file is not valid.
+        """
+        return self.held.decode() if isinstance(self.held, Deferred) else self.held
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """The shape of the texels, without decoding them."""
+        return self.held.shape
+
+    @property
     def size(self) -> int:
         """The side of a cube's faces, or the height of any other level, in texels."""
-        return self.texels.shape[-3]
+        return self.shape[-3]
 
 
 @dataclass(frozen=True)
@@ -101,6 +115,7 @@ class Contents:
     largest      largest finite value that each channel of the format holds; () where values do not reach it
     statement    statements of this tool, where it wrote the file
     notices      sentences about assumptions and about data that could not be decoded
+    said         sentences about values that a conversion changed, of the levels that have been decoded
     """
 
     path: Path
@@ -116,6 +131,7 @@ class Contents:
     largest: tuple[float, ...] = ()
     statement: Statement | None = None
     notices: tuple[str, ...] = ()
+    said: list[str] = field(default_factory=list)
 
     @property
     def written_for(self) -> tuple[str, str] | None:
@@ -334,7 +350,7 @@ def _of_light(path: Path, statement: Statement | None) -> Contents:
             light.facts,
             light.largest,
             statement,
-            (light.undecoded,),
+            (light.undecoded, *light.notices),
         )
     kind, placed, notices = _light_kind(light, statement)
     roughness = _roughness_of(light, statement, placed)
@@ -366,11 +382,14 @@ def _of_light(path: Path, statement: Statement | None) -> Contents:
         light.facts,
         light.largest,
         statement,
-        notices,
+        (*light.notices, *notices),
+        light.said,
     )
 
 
-def _light_kind(light: Light, statement: Statement | None) -> tuple[str, Sequence[np.ndarray], tuple[str, ...]]:
+def _light_kind(
+    light: Light, statement: Statement | None
+) -> tuple[str, Sequence[np.ndarray | Deferred], tuple[str, ...]]:
     """Return the kind of a light, its levels in the layout of that kind, and notices."""
     first = light.levels[0]
     if light.cube:
@@ -381,13 +400,16 @@ def _light_kind(light: Light, statement: Statement | None) -> tuple[str, Sequenc
         return "image array", light.levels, ()
     if first.shape[-1] == 2:
         return "table", light.levels, ()
-    found = faces_of(first)
-    if found is None:
+    # A view of one number has the shape without its memory.
+    layout = faces_of(np.broadcast_to(np.float32(0), first.shape))
+    if layout is None:
         return "image", light.levels, ()
-    if found[0] == "latlong":
+    if layout[0] == "latlong":
         return ("lat-long" if first.shape[1] > 1 else "image"), light.levels, ()
     if len(light.levels) > 1:
         return "image", light.levels, ()
+    found = faces_of(first.decode() if isinstance(first, Deferred) else first)
+    assert found is not None
     return "cube", (found[1],), (f"taken as a {found[0]}, by its aspect ratio",)
 
 
@@ -597,7 +619,9 @@ def _stated_levels(statement: Statement | None) -> dict[int, Mapping[str, Any]]:
     return {k: row for k, row in enumerate(rows) if isinstance(row, Mapping)} if isinstance(rows, list) else {}
 
 
-def _roughness_of(light: Light, statement: Statement | None, levels: Sequence[np.ndarray]) -> list[float | None]:
+def _roughness_of(
+    light: Light, statement: Statement | None, levels: Sequence[np.ndarray | Deferred]
+) -> list[float | None]:
     """Return the roughness of each level, or None.
 
     It comes from the container, from a key `roughness`, or from a manifest whose levels have the same sizes.
@@ -663,46 +687,82 @@ class Statistics:
 
 
 def statistics(found: Contents, level: Level) -> Statistics:
-    """Compute the statistics of a level."""
+    """Compute the statistics of a level, over bands of its rows, so that they take little memory beside the texels."""
     texels = level.texels
-    alpha = None
-    if texels.shape[-1] == 4 and found.kind not in ("table", "arrays"):
-        coverage = texels[..., 3]
-        if not np.all(coverage == 1):
-            alpha = (float(np.nanmin(coverage)), float(np.nanmax(coverage))) if not np.isnan(coverage).all() else None
-        texels = texels[..., :3]
-    finite = np.isfinite(texels)
-    clean = texels if finite.all() else np.where(finite, texels, np.float32(0))
-    weights = _weights(found, level)
-    total = np.broadcast_to(weights, texels.shape[:-1])
-    means = []
-    for k in range(texels.shape[-1]):
-        weight = float((total * finite[..., k]).sum())
-        means.append(float((clean[..., k] * total).sum(dtype=np.float64)) / weight if weight else math.nan)
-    at = 0
-    for k, largest in enumerate(found.largest[: texels.shape[-1]]):
-        at += int(np.count_nonzero(clean[..., k] >= np.float32(largest)))
-    some = texels[finite]
-    low, high = (float(some.min()), float(some.max())) if some.size else (math.nan, math.nan)
-    nan = int(np.count_nonzero(np.isnan(texels)))
-    return Statistics(
-        low,
-        high,
-        tuple(means),
-        nan,
-        int(finite.size - np.count_nonzero(finite)) - nan,
-        int(np.count_nonzero(texels < 0)),
-        at,
-        alpha,
-    )
+    height, width, channels = texels.shape[-3:]
+    weights = np.broadcast_to(_weights(found, level), (height, width))
+    rows = texels.reshape(-1, width, channels)
+    coloured = 3 if channels == 4 and found.kind not in ("table", "arrays") else channels
+    total = _Sums(coloured, found.largest[:coloured])
+    band = max(1, _BAND // (width * channels))
+    for start in range(0, len(rows), band):
+        part = rows[start : start + band]
+        total.add(part, weights[np.arange(start, start + len(part)) % height])
+    return total.statistics()
+
+
+_BAND = 1 << 20
+"""Values whose statistics are computed at once."""
+
+
+class _Sums:
+    """Statistics of the values of a level, gathered band by band."""
+
+    def __init__(self, channels: int, largest: Sequence[float]) -> None:
+        self.channels, self.largest = channels, np.array(largest, np.float32)
+        self.low, self.high = math.inf, -math.inf
+        self.sums, self.weights = np.zeros(channels), np.zeros(channels)
+        self.nan = self.infinite = self.negative = self.at_limit = 0
+        self.alpha: tuple[float, float] | None = None
+        self.partial = False
+
+    def add(self, rows: np.ndarray, weights: np.ndarray) -> None:
+        """Add rows (n, width, channels) with the weights (n, width) of their texels."""
+        if rows.shape[-1] > self.channels:
+            coverage = rows[..., 3]
+            self.partial = self.partial or not np.all(coverage == 1)
+            there = coverage[~np.isnan(coverage)]
+            if there.size:
+                ends = float(there.min()), float(there.max())
+                self.alpha = ends if self.alpha is None else (min(ends[0], self.alpha[0]), max(ends[1], self.alpha[1]))
+            rows = rows[..., : self.channels]
+        finite = np.isfinite(rows)
+        clean = rows if finite.all() else np.where(finite, rows, np.float32(0))
+        some = clean if clean is rows else rows[finite]
+        if some.size:
+            self.low, self.high = min(self.low, float(some.min())), max(self.high, float(some.max()))
+        self.sums += np.einsum("ijk,ij->k", clean, weights, dtype=np.float64)
+        self.weights += np.einsum("ijk,ij->k", finite, weights, dtype=np.float64)
+        nan = int(np.count_nonzero(np.isnan(rows)))
+        self.nan += nan
+        self.infinite += int(finite.size - np.count_nonzero(finite)) - nan
+        self.negative += int(np.count_nonzero(rows < 0))
+        if self.largest.size:
+            self.at_limit += int(np.count_nonzero(clean[..., : self.largest.size] >= self.largest))
+
+    def statistics(self) -> Statistics:
+        """Return the statistics of all that was added."""
+        none = self.low > self.high
+        with np.errstate(divide="ignore", invalid="ignore"):
+            means = np.where(self.weights > 0, self.sums / self.weights, math.nan)
+        return Statistics(
+            math.nan if none else self.low,
+            math.nan if none else self.high,
+            tuple(means.tolist()),
+            self.nan,
+            self.infinite,
+            self.negative,
+            self.at_limit,
+            self.alpha if self.partial else None,
+        )
 
 
 def _weights(found: Contents, level: Level) -> np.ndarray:
     """Return the weights of the texels in means, which broadcast to them: solid angles, or 1 for a table."""
-    if (found.cube or level is found.irradiance) and level.texels.ndim >= 4:
+    if (found.cube or level is found.irradiance) and len(level.shape) >= 4:
         return cube_solid_angles(level.size)
     if found.kind == "lat-long" and level is not found.dfg:
-        return latlong_solid_angles(*level.texels.shape[:2])[:, None]
+        return latlong_solid_angles(*level.shape[:2])[:, None]
     return np.ones(())
 
 
@@ -727,13 +787,13 @@ def described(found: Contents) -> dict[str, Any]:
             "manifest": None if found.statement.manifest is None else str(found.statement.manifest),
             "whole": found.statement.whole,
         },
-        "notices": list(found.notices),
+        "notices": [*found.notices, *found.said],
     }
 
 
 def _row(found: Contents, level: Level) -> dict[str, Any]:
     said = statistics(found, level)
-    shape = level.texels.shape
+    shape = level.shape
     faces = len(shape) >= 4 and (found.cube or level is found.irradiance)
     size = f"{level.size}²" if faces else "×".join(str(n) for n in shape[-2:-4:-1])
     return {
@@ -780,7 +840,7 @@ def _fits(found: Contents, engine: Engine, file: File) -> bool:
         return False
     many = len(found.levels) > 1
     if file.holds == "dfg":
-        return found.kind in ("table", "image") and found.levels[0].texels.shape[:2] == (engine.dfg.size,) * 2
+        return found.kind in ("table", "image") and found.levels[0].shape[:2] == (engine.dfg.size,) * 2
     if file.holds in ("specular", "sheen"):
         chain = found.cube and many and (found.levels[-1].size == 1 or not engine.whole)
         # Filament's loader needs the harmonics in the file.

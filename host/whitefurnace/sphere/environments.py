@@ -229,7 +229,7 @@ def extent(source: str | os.PathLike[str]) -> tuple[str, int, int]:
         size = image_facts(_face_paths(path)[0]).height
         return "cube", size, size
     if is_light(path):
-        pixels, cube = read_radiance(path)
+        pixels, cube, _ = read_radiance(path)
         if cube:
             return "cube", pixels.shape[1], pixels.shape[2]
         height, width = pixels.shape[:2]
@@ -285,8 +285,8 @@ def _from_image(path: Path, zero: bool) -> Environment:
 
 def _from_container(path: Path, zero: bool) -> Environment:
     """Level 0 of a cube, or a 2-D texture in one of the layouts."""
-    pixels, cube = read_radiance(path)
-    notices: list[str] = []
+    pixels, cube, said = read_radiance(path)
+    notices = list(said)
     if cube:
         _clean(pixels, None, str(path), zero, notices)
         return _cube(pixels, path.stem, "cube", light_digest(path), notices)
