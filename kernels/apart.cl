@@ -1,6 +1,7 @@
-// The excess of bright texels, a list of (x, y, z, w, wL_r, wL_g, wL_b, 0), exactly for every output: sums as those of
-// `convolve_close` (octahedral.cl), one exchange of axes a work item, times `factor`, added to what is there where `add`. By the
-// NDF itself, not by its series: a sun 1e5 times the mean is seen where its lobe is 1e-9 of its peak.
+// The excess of bright texels, a list of (x, y, z, w, wL_r, wL_g, wL_b, 0), exactly for every output: the sums of
+// `convolve_close` (octahedral.cl), one exchange of axes for each work item, times `factor`; with `add` they are added
+// to the buffer. The NDF itself is evaluated, not its series: a sun of 1e5 times the mean is visible where its lobe is
+// 1e-9 of its peak.
 __kernel void convolve_apart(__global scalar *restrict partial, const int outputs, const int sources,
                              __global const scalar *restrict direction, __global const scalar *restrict source,
                              const scalar factor, const int add NDF_SCALARS) {

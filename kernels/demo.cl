@@ -1,5 +1,5 @@
-// The built-in environment: a sky by a smooth gradient, a sun with sharp edges, a checkered ground. Not a
-// sky model: a hard test input that anybody can compute again.
+// The built-in environment: a sky by a smooth gradient, a sun with sharp edges, a checkered ground. It is
+// not a sky model but a hard test input that anybody can compute again.
 
 // radiance: [height][2 height][3]; `sun` is a unit direction, cos_sun the cosine of its angular radius, and
 // `power` its radiance. Each texel is the mean of `cuts` × `cuts` points with the weight sin θ.

@@ -1,19 +1,19 @@
-// What a rough boundary of two insulators reflects and lets through of the light that comes along v, by microfacets m
-// that each reflect F(v·m) and refract the rest. [Walter2007, eqs. 20, 21 and 22] Lanes are cells.
+// The light from direction v that a rough boundary of two insulators reflects and transmits, by microfacets m that each
+// reflect F(v·m) and refract the rest. [Walter2007, eqs. 20, 21 and 22] Lanes are cells.
 //
 // Over microfacets the Jacobians of reflection (eq. 14) and refraction (eq. 17) leave the same form for both,
 //   R = ∫ F D V (n·l_r)(v·m) dω_m,   T = ∫ (1 - F) D V |n·l_t|(v·m) dω_m,   V = G/((n·v)|n·l|),
 // energy of light that arrives from v, whichever way it is followed; radiance in T has n² besides, which is no energy.
 // G is the masking's for |n·l| on either side: of Smith's height-correlated form 1/(1 + Λ(v) + Λ(l)), as in renderers.
 //
-// Microfacets are counted in the frame of v: θ_c between m and v, ψ about v from the normal. Fresnel's term depends on θ_c
-// alone, and every bound on m is one on n·m at fixed θ_c, thus on σ = sin²(ψ/2): n·m = cos δ - 2 sin θ_c sin θ_v σ, δ =
-// θ_c - θ_v. Reflected light is above the horizon where n·m > n·v/(2 cos θ_c), a front face has n·m > 0, and refracted light
-// is below it where n·m < n·v/(cos θ_c - n cos θ_t), which binds for n < 1 only.
-// The polar variable x is the larger of θ_c and θ_t: sin θ_c = κ sin x with κ = min(n, 1) and sin θ_t = sin x/max(n, 1), so
-// total reflection ends the range at x = π/2, where 1 - F falls like cos x without the root it has in θ_c. Nodes in x are
-// graded by sinh from the lobe, x_v, with its width w; in ψ so from 0, with the distance to the lobe at that θ_c. Panels
-// end at x_v and where a bound on ψ begins to bind:
+// Microfacets are counted in the frame of v: θ_c between m and v, ψ about v from the normal. Fresnel's term depends on
+// θ_c alone, and every bound on m is one on n·m at fixed θ_c, thus on σ = sin²(ψ/2): n·m = cos δ - 2 sin θ_c sin θ_v σ,
+// δ = θ_c - θ_v. Reflected light is above the horizon where n·m > n·v/(2 cos θ_c), a front face has n·m > 0, and
+// refracted light is below it where n·m < n·v/(cos θ_c - n cos θ_t), which binds for n < 1 only.
+// The polar variable x is the larger of θ_c and θ_t: sin θ_c = κ sin x with κ = min(n, 1) and sin θ_t = sin x/max(n,
+// 1), so total reflection ends the range at x = π/2, where 1 - F falls like cos x without the root it has in θ_c. Nodes
+// in x are graded by sinh from the lobe, x_v, with its width w; in ψ so from 0, with the distance to the lobe at that
+// θ_c. Panels end at x_v and where a bound on ψ begins to bind:
 //   reflected  θ_c = (π/2 - θ_v)/2 (from there n·l_r > 0 binds)  and  θ_c = (π/2 + θ_v)/2, the last
 //   refracted  θ_c = π/2 - θ_v (n·m > 0)  and, n < 1,  tan θ_c = n·v/(1/n - sin θ_v), where l_t meets the horizon at ψ = 0.
 // Bounds begin to bind like a root there: x -> x²(3 - 2x) in every panel takes it.
@@ -24,8 +24,8 @@ static inline real asinh_(real x) {
   return x < 0 ? -y : y;
 }
 
-// out: [2][cells], first the reflected share, of n < 1 what would have been reflected but is not: ∫ (1 - F) …, since F = 1
-// beyond the range of x; theta and psi: (x, w) of a panel.
+// out: [2][cells], first the reflected share, of n < 1 what would have been reflected but is not: ∫ (1 - F) …, since F
+// = 1 beyond the range of x; theta and psi: (x, w) of a panel.
 __kernel void integrate(__global scalar *restrict out, const int cells, const int nodes,
                         __global const scalar *restrict theta, const int azimuths,
                         __global const scalar *restrict psi CELL_ARRAYS) {

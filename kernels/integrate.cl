@@ -1,4 +1,4 @@
-// The one loop over cells and nodes; lanes are cells. The rule is in ring.clh, what is integrated in integrand/.
+// The one loop over cells and nodes; lanes are cells. The rule is in ring.clh, the integrands are in integrand/.
 
 // out: [COMPONENTS][cells]; theta: (x, w) of both panels, `first` nodes in panel 0; phi: (x, w).
 __kernel void integrate(__global scalar *restrict out, const int cells, const int first, const int nodes,

@@ -1,5 +1,5 @@
-// A level from its values at the nodes of an equiangular grid: where a level has more texels than its lobe lets it have
-// detail, it is convolved at the nodes and read at the texels by ORDER-point Lagrange interpolation.
+// A level from its values at the nodes of an equiangular grid: where a level has more texels than its lobe has
+// detail, it is convolved at the nodes and interpolated at the texels by ORDER-point Lagrange interpolation.
 
 // level: texels [first, first + count), RGB. grid: [6][n][n] of 4 numbers. latlong: size rows of 2·size texels.
 __kernel void interpolate(__global float *restrict level, const int first, const int count, const int size,

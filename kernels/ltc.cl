@@ -1,9 +1,8 @@
-// Linearly transformed cosines against a BRDF [Heitz2016]: what a fit is steered by, and what it is off by. Lanes are
-// cells.
+// Linearly transformed cosines against a BRDF [Heitz2016]: the error of a fit and its derivatives. Lanes are cells.
 //
 // With w = N ω, N = M⁻¹ of rows (xx 0 xz), (0 1 0), (zx 0 zz), the distribution is [Heitz2016, eq. 2 and 3]
 //   p(ω) = det N max(w.z, 0)/(π |w|⁴),   ∫ p dω = 1 over the sphere,
-// and what it should be is f(l, v) (n·l)/E, E the albedo: with v = (sin θ_v, 0, cos θ_v) both are even in y.
+// and its target is f(l, v) (n·l)/E, where E is the albedo: with v = (sin θ_v, 0, cos θ_v) both are even in y.
 #define INV_PI ((scalar)0.31830988618379067154)
 
 // Sums over half vectors (ring.clh) of m = |f̂ - p| dω over l above the surface and, for a step N <- (1 + δ) N, of its

@@ -1,14 +1,16 @@
 // Zonal convolution by the symmetries of the cube. An equiangular grid and the texel centres of a cube or a lat-long
-// image are both carried into themselves by reflections of the axes and by exchanges of axes (PERMS of them: all 6
-// for a cube, x with z alone for a lat-long), and K(l·r) does not change when both its directions are moved alike.
+// image are both mapped onto themselves by reflections of the axes and by exchanges of axes (PERMS of them: all 6
+// for a cube, x with z alone for a lat-long), and K(l·r) does not change when the same symmetry maps both directions.
 // With outputs o of one fundamental domain, sources c of the positive octant, reflections t, s and exchanges ρ,
 //   out[ρ t o] = ∑_c ∑_s K(o·s c) (wL)[ρ (t s) c],
-// so each value of the kernel serves 8·PERMS pairs. Lanes are outputs o; classes c stream by as uniform scalars.
+// so each value of the kernel serves 8·PERMS pairs. Each SIMD lane computes one output o; classes c are read as uniform
+// scalars.
 //
 // Where much of the sphere counts, the sum over s is a convolution on the group of reflections, which a Walsh-Hadamard
-// transform of K and of wL makes 8 products instead of 64 (`convolve_all`). The transform adds what eight mirrored directions
-// see before it takes it apart again: in float32 a dark one among them keeps 1e-7 of the brightest. A narrow part of a
-// lobe, whose values differ most, meets one image of a class at most, needs no transform and takes none (`convolve_close`).
+// transform of K and of wL makes 8 products instead of 64 (`convolve_all`). The transform adds the values of eight
+// mirrored directions and then separates them again: in float32 a dark one among them has an error of 1e-7 of the
+// brightest. A narrow part of a lobe, whose values differ most, reaches at most one image of a class and is summed
+// without a transform (`convolve_close`).
 //
 // partial: [split][8·CHANNELS + 1][outputs], CHANNELS = 3·PERMS: the sums, then ∑K w.
 
@@ -20,8 +22,8 @@
 #define QUAD float4
 #endif
 
-// A class as whole numbers: its grid coordinates, odd and positive, and n along its face's axis. Classes are quarter faces
-// +x +y +z, in tiles within runs where a quarter face is made of whole runs.
+// A class as whole numbers: its grid coordinates, odd and positive, and n along its face's axis. Classes are quarter
+// faces +x +y +z, in tiles within runs where a quarter face is made of whole runs.
 static inline xyz class_numbers(int c, int n) {
   const int half_n = n / 2, face = c / (half_n * half_n), rest = c % (half_n * half_n);
   const int run = rest / RUN, tile = rest / TILE % (RUN / TILE), in_tile = rest % TILE;
@@ -54,7 +56,8 @@ static inline int place_of(int c, int e, int u, int n, __global const int *restr
   return place ? place[48 * (size_t)c + 8 * e + u] : face_index(exchanged(reflected(class_numbers(c, n), u), e), n);
 }
 
-// node: [classes] of (x, y, z, w), w the weight of one source, the mean over all 48 images: what no texel's shape disturbs.
+// node: [classes] of (x, y, z, w), w the weight of one source, the mean over all 48 images: what no texel's shape
+// disturbs.
 __kernel void class_nodes(__global scalar *restrict node, const int n, __global const scalar *restrict tangent,
                           __global const int *restrict place, __global const scalar *restrict grid) {
   const int c = get_global_id(0);
@@ -131,7 +134,8 @@ static inline void add_classes(__global scalar *restrict out, int g, int outputs
   }
 }
 
-// A chunk is a multiple of RUN classes. T groups of outputs, one after the other, take the same RUN while it is in cache.
+// A chunk is a multiple of RUN classes. T groups of outputs, one after the other, take the same RUN while it is in
+// cache.
 __kernel void convolve_all(__global scalar *restrict partial, const int outputs, const int classes, const int chunk,
                            const int first_split, __global const scalar *restrict direction,
                            __global const scalar *restrict node, __global const scalar *restrict moment LOBE_SCALARS) {
@@ -146,8 +150,8 @@ __kernel void convolve_all(__global scalar *restrict partial, const int outputs,
                   first, min(RUN, end - first), classes, node, moment LOBE_VALUES);
 }
 
-// group: {x, y, z, radius} of the W outputs of a work item; tile: of every RUN classes, then of each TILE of them. By the
-// triangle inequality of chords no pair is nearer than `reach` if this holds.
+// group: {x, y, z, radius} of the W outputs of a work item; tile: of every RUN classes, then of each TILE of them. By
+// the triangle inequality of chords no pair is nearer than `reach` if this holds.
 static inline int beyond(__global const scalar *restrict bound, xyz sign, __global const scalar *restrict group,
                          scalar reach) {
   const scalar dx = sign.x * bound[0] - group[0], dy = sign.y * bound[1] - group[1], dz = sign.z * bound[2] - group[2];
@@ -155,7 +159,8 @@ static inline int beyond(__global const scalar *restrict bound, xyz sign, __glob
   return dx * dx + dy * dy + dz * dz > apart * apart;
 }
 
-// Of `classes` images from class `origin` on, a multiple of RUN; the first piece, of origin 0, finds `partial` undefined.
+// Of `classes` images from class `origin` on, a multiple of RUN; the first piece, of origin 0, finds `partial`
+// undefined.
 __kernel void convolve_close(__global scalar *restrict partial, const int outputs, const int origin, const int classes,
                              const int chunk, const int first_split, __global const scalar *restrict direction,
                              __global const scalar *restrict node, __global const scalar *restrict image,
@@ -203,8 +208,8 @@ __kernel void convolve_close(__global scalar *restrict partial, const int output
     }
 }
 
-// number: two whole numbers of each output o. Of a cube of size × size: its two smaller coordinates, odd (0 where size is 1).
-// Of a lat-long image of size rows: its row, and its azimuth from +X in units of π/columns, odd.
+// number: two whole numbers of each output o. Of a cube of size × size: its two smaller coordinates, odd (0 where size
+// is 1). Of a lat-long image of size rows: its row, and its azimuth from +X in units of π/columns, odd.
 static inline int texel_of(int a, int b, int e, int t, int size, int latlong) {
   if (!latlong) {
     const xyz o = {a, b, size};
@@ -217,8 +222,8 @@ static inline int texel_of(int a, int b, int e, int t, int size, int latlong) {
   return row * columns + ((m - 1) / 2 + columns / 2 + 2 * columns) % columns;
 }
 
-// Every texel of the level: ∑ wL K/∑ w K + apart·per_norm + base, scattered to all images of the outputs, `stride` numbers a
-// texel. Without sums (alls = 0) the rest is added to what the level holds.
+// Every texel of the level: ∑ wL K/∑ w K + apart·per_norm + base, scattered to all images of the outputs, `stride`
+// numbers a texel. Without sums (alls = 0) the rest is added to what the level holds.
 __kernel void unfold(__global float *restrict level, const int stride, const int outputs, const int count, const int size,
                      const int latlong, __global const int *restrict number, __global const scalar *restrict all,
                      const int alls, __global const scalar *restrict close, const int closes,

@@ -1,12 +1,12 @@
 // Level 0: the mean radiance of the source over each output texel, by exact areas of overlap. Areas are made in
-// float64: beside a sun 1e5 times the mean, a sliver of 1e-7 of a texel is an error of 1 %, and float32 places edges
-// no better than that.
+// float64: next to a sun of 1e5 times the mean, a sliver of 1e-7 of a texel is an error of 1 %, and float32 places
+// edges no better than that.
 
-// ---- a lat-long source on a cube: a list of source texels and weights for each output texel ---------------------
-// The areas depend on the two grids alone, so they are made once (`overlap_list`) and every image of that size is a
-// sum over them (`mean_by_list`). With azimuth φ and V = 1 - cos θ, dω = dφ dV. A cube texel is cut into strips of
-// azimuth that lie in one source column, between two great circles cot θ = A cos ψ, ψ = φ - φ0; what row r has above one
-// of them is ∫ clamp(V, V_r, V_r+1) - V_r dφ in closed form, because with B = A/√(1 + A²)
+// ---- a lat-long source on a cube: a list of source texels and weights for each output texel --------------------- The
+// areas depend on the two grids alone, so they are made once (`overlap_list`) and every image of that size is a sum
+// over them (`mean_by_list`). With azimuth φ and V = 1 - cos θ, dω = dφ dV. A cube texel is cut into strips of azimuth
+// that lie in one source column, between two great circles cot θ = A cos ψ, ψ = φ - φ0; the area of row r above one of
+// them is ∫ clamp(V, V_r, V_r+1) - V_r dφ in closed form, because with B = A/√(1 + A²)
 //     ∫ cos θ dψ = asin(B sin ψ).
 //
 // The cube has the grid's symmetries: the equator mirrors both, and where 4 divides the columns a quarter turn brings
@@ -271,11 +271,11 @@ __kernel void mean_latlong(__global float *restrict level, const int height, con
   for (int k = 0; k < 3; k++) level[3 * (size_t)g + k] = sum[k] / weight;
 }
 
-// ---- a cube source on a cube that is not turned: rectangles of the faces ---------------------------------------
-// The edges of both grids cut a face into pieces of one source texel and one output texel each: `source` is the
-// source row (or column) of each strip of pieces, first[i] … first[i + 1] - 1 are the strips of output row i, and `area`,
-// [pieces][pieces], their solid angles, which all six faces share. A work item makes the texels (i, j) of all of
-// them. level: [6][height][height][3].
+// ---- a cube source on a cube that is not turned: rectangles of the faces --------------------------------------- The
+// edges of both grids cut a face into pieces of one source texel and one output texel each: `source` is the source row
+// (or column) of each strip of pieces, first[i] … first[i + 1] - 1 are the strips of output row i, and `area`,
+// [pieces][pieces], their solid angles, which all six faces share. A work item makes the texels (i, j) of all of them.
+// level: [6][height][height][3].
 __kernel void mean_aligned(__global float *restrict level, const int height, const int size, const int pieces,
                            __global const int *restrict first, __global const int *restrict source,
                            __global const scalar *restrict area, __global const float *restrict radiance) {

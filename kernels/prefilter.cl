@@ -1,11 +1,11 @@
-// Zonal convolution, plainly: for every output direction r the sum of a lobe K(l·r) over a list of sources
-// (direction, weight, weight × radiance). What certificates are made of: the NDF itself, texel by texel.
+// Zonal convolution by direct summation: for every output direction r the sum of a lobe K(l·r) over a list of sources
+// (direction, weight, weight × radiance). Certificates use it: it evaluates the NDF itself, texel by texel.
 
-// source: 8 scalars each, {x, y, z, w, wL_r, wL_g, wL_b, 0}. Lanes are outputs; sources stream by as uniform
-// scalars. The source is cut into fixed chunks, so that rounding does not grow with its length (393k terms:
-// 5e-5 in one run, 7e-7 in chunks of 8192) and the result does not depend on the device.
+// source: 8 scalars each, {x, y, z, w, wL_r, wL_g, wL_b, 0}. Each SIMD lane computes one output direction; sources are
+// read as uniform scalars. The source is cut into fixed chunks, so that rounding does not grow with its length (393k
+// terms: 5e-5 in one run, 7e-7 in chunks of 8192) and the result does not depend on the device.
 // partial: [split][4][outputs] = ∑K wL (rgb) and ∑K w. direction: [3][outputs]; outputs a multiple of W·T.
-// Only what lies beyond a window is summed where per_window is not 0 (`convolve_texels` sums the rest).
+// Where per_window is not 0, only sources beyond a window are summed (`convolve_texels` sums the others).
 #define RUN 128
 
 // Sums of at most RUN terms are made apart and then added: two short sums round less than one long one, and a

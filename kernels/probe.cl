@@ -1,4 +1,4 @@
-// Tells a device that works from one that is only listed: lanes, sqrt, fma, a division and a loop with a
+// Tests whether a listed device works: lanes, sqrt, fma, a division and a loop with a
 // uniform scalar, in the working precision. host/whitefurnace/opencl/device.py knows the right answer.
 // -DSCALAR=float|double  -DW=1|2|4|8|16 lanes
 

@@ -1,5 +1,5 @@
-// The mip pyramid of a cube that is read between texels: 4 scalars a texel (rgb and a pad, so that a row's two
-// neighbours are one load), level k of n = size >> k texels an edge at texel PYRAMID_OFFSET, six faces of (n + 2)²
+// The mip pyramid of a cube that is read between texels: 4 scalars per texel (rgb and a pad, so that a row's two
+// neighbours are one load), level k of n = size >> k texels per edge at texel PYRAMID_OFFSET, six faces of (n + 2)²
 // texels each. The frame around a face holds the texels beyond its edges, so that a bilinear read never asks which face
 // a neighbour is on.
 

@@ -1,6 +1,6 @@
 // The nodes of an environment's texels in the frame of a surface: seven rows {x, y, z, weight, and weight × radiance},
-// so that lanes read neighbours. Texels that a view takes closer are left out.
-// frame: rows of the matrix to the local frame; skip: one byte a texel, or a null pointer.
+// so that lanes read neighbours. Texels that a view sums more finely are left out.
+// frame: rows of the matrix to the local frame; skip: one byte per texel, or a null pointer.
 
 __kernel void frame_nodes(__global scalar *restrict list, const int stride, const int first_row, const int count,
                           __global const scalar *restrict frame, __global const uchar *restrict skip,

@@ -1,11 +1,11 @@
 // Filtered importance sampling [Krivanek2008, sec. 3; Colbert2007, GPU Gems 3, eq. 12-13]: for every output direction n
 // a sum over one set of samples l, drawn by the NDF in the frame of n, each read from the level of the pyramid whose
-// texels are as large as what the sample stands for, Ω = 1/(N pdf).
+// texels are as large as the solid angle of the sample, Ω = 1/(N pdf).
 //
 // sample: 5 scalars each, {x, y, z, weight, lod}: l in the frame of n, its share n·l/∑ n·l of the result, and ½ log2 of
-// Ω over the solid angle of a texel at the middle of a face. Lanes are outputs; samples stream by as uniform scalars.
-// They are sorted by lod: the first `flat` never leave level 0 and need one read, the others two. Directions and
-// addresses are made in W lanes, then a scalar loop reads: a gather of 16 lanes is slower than 16 loads.
+// Ω over the solid angle of a texel at the middle of a face. Each SIMD lane computes one output; samples are read as
+// uniform scalars. They are sorted by lod: the first `flat` never leave level 0 and need one read, the others two.
+// Directions and addresses are made in W lanes, then a scalar loop reads: a gather of 16 lanes is slower than 16 loads.
 
 #if W == 1
 typedef int whole;
@@ -27,8 +27,8 @@ typedef struct {
 } Place;
 
 // Face and place on it, as cube_face and to_face have them: with 1/d of the largest component, signed, s and t are
-// products. A texel at (s, t) has q^(-3/2) of the solid angle at the middle, q = 1 + s² + t², so its samples are ¾ log2 q
-// levels higher: a polynomial on [1, 3], |error| < 1e-3 of a level, continuous from face to face since q is.
+// products. A texel at (s, t) has q^(-3/2) of the solid angle at the middle, q = 1 + s² + t², so its samples are ¾ log2
+// q levels higher: a polynomial on [1, 3], |error| < 1e-3 of a level, continuous from face to face since q is.
 static inline Place place_of(real3 d, scalar lod) {
   const real ax = fabs(d.x), ay = fabs(d.y), az = fabs(d.z);
   const real face = (ax >= ay) & (ax >= az) ? (real)0 : ay >= az ? (real)2 : (real)4;

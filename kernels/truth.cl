@@ -1,15 +1,16 @@
 // The reflectance integral of surface points by importance sampling: L_o(v) = ∫ L(l) f(l, v)(n·l) dω as the mean of
-// L f (n·l)/pdf over samples l, each read from the level of the pyramid whose texels are as large as what it stands for,
-// Ω = 1/(N pdf) [Krivanek2008, sec. 3]. How l is drawn is compiled in:
+// L f (n·l)/pdf over samples l, each read from the level of the pyramid whose texels are as large as the sample's
+// solid angle Ω = 1/(N pdf) [Krivanek2008, sec. 3]. How l is drawn is compiled in:
 //
 //   VISIBLE  normals that v sees, of an ellipsoid: spherical caps in the space where it is a sphere [Dupuy2023]. Then
 //            pdf = D/(4 A(v)), A Smith's projected area, and what is left of f (n·l)/pdf is F V (n·l) A(v)
 //   NORMALS  normals of density D (n·h), any isotropic NDF: pdf = D (n·h)/(4 v·h), left is F V (n·l)(v·h)/(n·h)
 //   COSINE   directions of density n·l/π for a diffuse model: left is π f
 //
-// Lanes are outputs; samples stream by as uniform scalars, in the frame of x along v's projection, z = n. SETS sets of
+// Each SIMD lane computes one output; samples are read as uniform scalars, in the frame of x along v's projection,
+// z = n. SETS sets of
 // the models' numbers share the directions and the reads (Schlick of F0 0 and 1 gives all others; a metal's R, G, B): a
-// cell_values column each. The sum of weights comes too: its mean is the albedo, which the host knows better.
+// cell_values column each. The weights are summed too: their mean is the albedo, which the host computes more exactly.
 //
 // surface: [8][outputs]: n, x (world), n·v, √(1 - (n·v)²). sample: 4 scalars, the last what Ω takes of it alone.
 // partial: [split][SETS][4][outputs].

@@ -1,8 +1,8 @@
-// What a device can do at most, measured beside the kernels so that their speed is a ratio: multiply-adds that never leave
-// the registers, memory that is only read, and memory that is streamed.
+// The limits of a device, measured together with the kernels so that their speed is a ratio: multiply-adds in
+// registers, memory that is only read, and memory that is streamed.
 
-// Twelve chains side by side: a core with two units of four cycles each has 8 in flight, and twelve chains with their two
-// constants still fit AVX2's 16 registers. Named one by one, because an array might be kept in memory.
+// Twelve chains side by side: a core with two units of four cycles each has 8 in flight, and twelve chains with their
+// two constants still fit AVX2's 16 registers. Named one by one, because an array might be kept in memory.
 #define EACH(f) f(0) f(1) f(2) f(3) f(4) f(5) f(6) f(7) f(8) f(9) f(10) f(11)
 #define CHAINS 12
 #define ROUND EACH(STEP) EACH(STEP) EACH(STEP) EACH(STEP)  // so that the loop's own counting hides behind them
@@ -10,8 +10,8 @@
 #define STEP(k) x##k = fma(x##k, a, b);
 #define TOTAL(k) +x##k
 
-// 8·CHAINS·W operations a round and work item. start: [CHAINS][W]; each chain nears offset/(1 - factor), so that nothing
-// overflows or becomes subnormal, and no compiler knows it.
+// 8·CHAINS·W operations a round and work item. start: [CHAINS][W]; each chain nears offset/(1 - factor), so that
+// nothing overflows or becomes subnormal, and no compiler knows it.
 __kernel void multiply_add(__global scalar *restrict out, const int rounds, const scalar factor, const scalar offset,
                            __global const scalar *restrict start) {
   const real a = (real)factor, b = (real)offset;

@@ -289,7 +289,7 @@ def bake(
     fit: "read" fits the levels to how they are interpolated. as_read: measure the error after the engine's sampling.
     rotate: degrees about +Y. exposure: stops. nonfinite: "refuse" or "zero". sun: "keep", "extract" or "clamp=X".
     sh: "window=auto", "window=none" or "window=X", the window of engines' irradiance harmonics.
-    force: bake again, and replace files that are not known to be ours.
+    force: bake again, and overwrite files that this tool did not write.
     device: a `Device`, or a number or part of a name. dry_run: only return the plan.
     progress: called with the environment's name, the part that is made and the share done.
     Raises UsageError, FileError, InputError, UnsupportedError, CheckError, DeviceError; nothing is written for an
@@ -437,7 +437,7 @@ def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: 
         return None
     try:
         digest = source_digest(item)
-    except WhitefurnaceError:  # reading it says what is wrong
+    except WhitefurnaceError:  # reading it reports the error
         return None
     turn = math.radians(math.remainder(request.rotate, 360.0))
     recipe = _canonical(request, turn, request.exposure or 0.0)
@@ -748,7 +748,7 @@ def _programs(request: BakePlan, env: Environment) -> tuple[Program, ...]:
     """The kernel programs of a bake."""
     wants, _ = _wanted(request)
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
-    # What no engine has at all is made of no program.
+    # A part that no engine has needs no program.
     chains = [want.recipe for want in wants if (want.cubes, want.latlongs, want.octahedral) != (0, 0, 0)]
     charlie = [e.dfg.charlie_masking for e in request.engines if e.dfg.charlie and e.holding("dfg")]
     return programs(chains or [wants[0].recipe], env.kind, texel, demo=env.name == DEMO, charlie=charlie)

@@ -163,7 +163,7 @@ def _bytes(engine: Engine, path: Path, data: bytes, stated: Mapping[str, Any]) -
     )
 
 
-# ---------------------------------------------------------------------------------------------- what formats cost
+# ---------------------------------------------------------------------------------------------- errors of formats
 
 
 def _format_loss(kept: np.ndarray, true: np.ndarray, mean: float) -> dict[str, float]:

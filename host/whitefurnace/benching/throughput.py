@@ -51,7 +51,7 @@ CHAINS, STEPS_A_ROUND = 12, 4  # as yardstick.cl has them
 
 # Operations of one unit, counted in the kernel's text as it runs for GGX with Smith's masking and no Fresnel: an
 # addition, multiplication, division, root, comparison with its selection, minimum or maximum is 1, a fused multiply-add
-# 2, a polynomial what it is made of, a built-in (sin, exp, atan2 …) 1 whatever it takes. What does not change in the
+# 2, a polynomial the operations in it, a built-in (sin, exp, atan2 …) 1 whatever it takes. What does not change in the
 # inner loop, integers, addresses and scalars that all lanes share are left out: GFLOP/s is a lower bound.
 FLOPS: Mapping[str, float] = {
     # Differences 3, their square 5, the lobe 8 (q/4, α² + (1 - α²)sin²θ 2, /, square, 1 - q/2 and its maximum 3), its

@@ -95,7 +95,7 @@ LADDERS = {
         (0, 36, 36),
         (0, 48, 64),
     ),
-    # glass.cl: three panels for what is reflected, four for what is refracted
+    # glass.cl: three panels for reflected light, four for refracted light
     "refraction": _ladder(
         "refraction",
         7,

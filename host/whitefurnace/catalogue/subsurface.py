@@ -145,7 +145,7 @@ class Burley:
 
     @property
     def least(self) -> float:
-        # The line spread grows like log 1/x: what a first panel is off by must be as short as this.
+        # The line spread grows like log 1/x, so the first panel, which is inexact, must be as short as this.
         """Length in mm of the first panel of a quadrature, over which the line spread may be inexact."""
         return 1e-13 * float(self.d.min())
 

@@ -179,7 +179,7 @@ def _resources(to: _Writer, engine: Engine, levels: int, width: int, stem: str) 
         codes = ", its texels through decode_rgbd" if file.stored == "rgbd" else ""
         to.resource("2d", "dfg_map", f"{_name(file, stem)}, its first row at v = 0{codes}")
     if any(file.stored == "rgbd" for file in (*engine.holding("specular"), *engine.holding("dfg"))):
-        # Between codes there is no colour: what is filtered must be decoded.
+        # A value between two codes is no colour, so texels must be decoded before they are filtered.
         power = to.vector("2.2", "2.2", "2.2")
         to.function(
             "vec3",
@@ -316,7 +316,7 @@ def _irradiance(to: _Writer, engine: Engine) -> None:
     zero, meaning = to.vector("0.0", "0.0", "0.0"), "E/pi"
     first = [("vec3", "d", "stored_direction(n)")]
     if _rows(engine) is not None and engine.sh == "babylon":
-        # What harmonic.babylon inverts: 3/2 and 4 undo the cosine kernel that Babylon.js divides out.
+        # The inverse of harmonic.babylon: 3/2 and 4 undo the cosine kernel that Babylon.js divides out.
         value = (
             "1.5 * (sh[0] * d.x + sh[1] * d.y + sh[2] * d.z)",
             "sh[3] * (4.0 * d.x * d.x - 1.0) + sh[4] * (4.0 * d.y * d.y - 1.0) + sh[5] * (4.0 * d.z * d.z - 1.0)",

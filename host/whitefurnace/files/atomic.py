@@ -36,7 +36,7 @@ class Transaction:
         temporary = self.staging(path)
         self._targets.append(path)
         try:
-            # What is there may be a link, or a second name of a file: writing would go through to it.
+            # The name may be a link, or a second name of a file: writing would change that file.
             temporary.unlink(missing_ok=True)
             writer(temporary)
             with open(temporary, "rb+") as file:

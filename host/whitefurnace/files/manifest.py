@@ -13,7 +13,7 @@ import msgspec
 from whitefurnace.files.atomic import Transaction, write_atomic
 from whitefurnace.files.inputs import input_size, is_input, read_input
 
-# A manifest lists a few files; what is larger than this is somebody else's.
+# A manifest lists a few files; a larger file is not ours.
 _MAX_BYTES = 64 << 20
 
 

@@ -134,7 +134,7 @@ class Output(ABC):
                         file.unlink()
                 os.replace(Transaction.staging(self.path), self.path)
                 there, staged = staged, None
-        # What could not be completed still proves whose the renamed files are.
+        # An incomplete manifest still proves that the renamed files are ours.
         lock.sweep(keep=[Transaction.staging(self.path)] if staged else ())
         return there
 

@@ -26,7 +26,7 @@ from whitefurnace.results import Integrated
 DEFAULT_TOLERANCE = {32: 1e-6, 64: 1e-12}
 BACKFACING = ("clamp", "absolute")
 
-# What float32 leaves however fine the rule: a relative part of the value, as measured in
+# Error of float32 with any rule, relative to the value, as measured in
 # tests/integrals/test_integrate.py.
 ROUNDING = {32: 1e-6, 64: 2e-14}
 
@@ -283,7 +283,7 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
     names = {p.name for choice in slots.values() for p in choice.model.parameters}
     known = ["NoV", *([] if isotropic else ["phi"]), *sorted(names)] if entry.view else sorted(names)
     qualified_names = {f"{slot}_{p.name}" for slot, choice in slots.items() for p in choice.model.parameters}
-    # Before what is missing: a misspelt name is the reason why another is missing.
+    # Unknown names come before missing ones: a misspelt name is the reason why another is missing.
     for name in sorted(set(given) - {*known, *qualified_names}):
         raise UsageError(f"integral {entry.name} has no parameter {name!r}{_suggested(name, known)}")
     columns["NoV"] = np.ones(())
@@ -426,7 +426,7 @@ class Part:
                 at = entry.arguments.index("per_norm")
                 self.norms = (min(self.norms[0], 1 / numbers[at].max()), max(self.norms[1], 1 / numbers[at].min()))
                 if self.entry.name == "normalization":
-                    numbers[at] = 1  # the raw norm is what is asked
+                    numbers[at] = 1  # the raw norm is asked for
             ndf = numbers if entry.slot == "ndf" else ndf
             out.append(numbers)
             read += len(entry.parameters)
@@ -518,7 +518,7 @@ class Totals:
         )
 
 
-@np.errstate(invalid="ignore", over="ignore")  # what is infinite in float32 goes on in float64
+@np.errstate(invalid="ignore", over="ignore")  # values that are infinite in float32 are computed in float64
 def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precision: int | None = None) -> np.ndarray:
     """Integrate cells by finer and finer rules until two neighbouring rules agree: (components, n).
 

@@ -245,7 +245,7 @@ class _Task:
     def result(self, values: np.ndarray, start: float) -> Integrated:
         """Return the values with the error and the work so far; `start` is the clock's time at the beginning."""
         rule = self.totals.rule.name if self.totals.rule else self.rule
-        # What is left of float32 is the rounding of the values themselves.
+        # The remaining error of float32 is the rounding of the values themselves.
         rounding = float(np.abs(values).max()) * (6e-8 if self.precision == 32 else 1e-15)
         return Integrated(
             values,
@@ -768,7 +768,7 @@ class _Texels:
             count = share.size
             stride = self._stride(count, precision)
             listed = np.zeros((7, stride), kind)
-            listed[2] = 1  # what pads has no weight
+            listed[2] = 1  # padding has no weight
             listed[:3, :count] = self.directions(face.ravel(), i.ravel(), j.ravel())
             listed[3, :count] = share
             listed[4:, :count] = share * self.rest[texel.ravel().astype(int)].T
@@ -808,7 +808,7 @@ class _Texels:
                 task.totals.promoted += len(index)
             cells, terms, table = self.whole.cells(rows[:, index], precision)
             alone = "ndf" in task.models or "brdf" in task.models
-            # Diffuse models see every texel alike and go together; a lobe has its own close texels for each view.
+            # Diffuse models share their texels for all views; a lobe has its own close texels for each view.
             for some in [np.array([k]) for k in range(len(index))] if alone else [np.arange(len(index))]:
                 group = cells[:, some]
                 skip, parts = self.close(group[:2, 0], widths[index[some[0]]]) if alone else (None, np.empty((0, 5)))

@@ -153,7 +153,7 @@ def _function_lines(slot: str, entry: Model, function: str, isotropic: bool) -> 
     head = f"({', '.join(dummies)})" if dummies else ""
     if function != "NDF_D":
         return [f"#define {function}{head} {call}"]
-    # D is 0 for backfacing m, whatever the model, and that of a user's file is divided by its norm: said once.
+    # For every model D is 0 for backfacing m, and a user's D is divided by its norm; both are written only here.
     front = (
         "#define NDF_D(a0, a1) ((a0) > 0 ? NDF_D_FRONT(a0, a1) : (real)0)"
         if isotropic

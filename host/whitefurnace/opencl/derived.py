@@ -138,7 +138,7 @@ class Areas:
             self._make(distinct[:, part], [keys[k] for k in part])
         made = np.stack([self._made[key][0] for key in keys], 1)
         rest = np.cumsum(np.abs(made[3:]).max(1)[::-1])[::-1]
-        # Every term costs a lane a multiply-add for each light direction: with all of them GGX is 10 times as fast.
+        # Every term costs each lane a multiply-add for each light direction: with all of them GGX is 10 times as fast.
         length = max(16, 8 * math.ceil(int((rest > max(AREA_KEPT[self.precision], tolerance / 10)).sum()) / 8))
         cut = float(rest[length]) if length < rest.size else 0.0
         return AreaTable(made[: 3 + length, which], length, cut + max(self._made[key][1] for key in keys))

@@ -55,8 +55,8 @@ TUNING = {
     "other": Tuning(vectors=1, local_size=16),
 }
 
-# What CPU runtimes read when they are loaded: PoCL to 4 and from 5, Intel's, and last the host's own libraries (numpy's
-# linear algebra, OpenImageIO).
+# Variables that CPU runtimes read when they are loaded: PoCL's up to 4 and from 5, Intel's, and those of the host's
+# own libraries (numpy's linear algebra, OpenImageIO).
 CORE_LIMITS = (
     "POCL_MAX_PTHREAD_COUNT",
     "POCL_CPU_MAX_CU_COUNT",

@@ -137,7 +137,7 @@ PROGRAMS: Mapping[str, Assembly] = {
     ),
     "nodes in the frame of a surface": Assembly(("real.clh", "sphere.clh", "texels/{kind}.clh", "radiance_texels.cl")),
     "reflectance integral": Assembly(
-        # samples.cl makes reals of what special.clh calls bits: one macro, of either.
+        # samples.cl and special.clh define one macro in different ways: it is undefined between them.
         ("real.clh", "sphere.clh", *_MODELS, "<between>", "pyramid.cl", "samples.cl", "truth.cl"),
         slots=(*_MICROFACETS, "diffuse"),
         cells=(),

@@ -274,6 +274,6 @@ def _mixture(c: np.ndarray, own: np.ndarray, allowed: np.ndarray, nodes: np.ndar
     if low.any():
         part = float((spare[low] / (spare[low] - (1 - LEAST / 2) * lobe[low])).max())
         c = (1 - part) * c + part * own
-    c = np.round(c, 6)  # rounding of linear algebra differs between machines, what is baked must not
+    c = np.round(c, 6)  # rounding of linear algebra differs between machines, and the bake must not
     c[np.abs(c).argmax()] += 1 - c.sum()
     return tuple((round(float(w), 6), float(r)) for w, r in zip(c, nodes, strict=True) if abs(w) > 5e-7)

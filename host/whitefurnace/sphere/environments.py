@@ -266,7 +266,7 @@ def _check_unchanged(path: Path, before: tuple[tuple[int, ...], ...] | None, dig
     """
     after = _stamps(path)
     changed = before is None or after != before
-    # A second write within a tick of the clock leaves the times as they were; its bytes tell.
+    # A second write within a tick of the clock leaves the times unchanged, so bytes are compared too.
     if not changed and max(max(s[3:]) for s in after or ((0,),)) > time.time_ns() - _FRESH:
         changed = source_digest(path) != digest
     if changed:

@@ -234,7 +234,7 @@ def _nearest(irradiance: np.ndarray, least: np.ndarray) -> np.ndarray:
     """
     channels = np.swapaxes(irradiance, -1, -2)  # (..., 3, 9)
     mean = channels[..., 0] * FACTORS[0]
-    # Rounding of sums: what an exact 0 may have become.
+    # Rounding of sums: the largest value that an exact 0 may become.
     scale = np.abs(channels).sum(-1) * _ROUNDING
     if (mean < 0).any():
         raise InputError("the mean of an SH channel is negative, so no window makes its irradiance non-negative")

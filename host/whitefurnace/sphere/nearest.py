@@ -24,7 +24,7 @@ def nearest_texels(shape: Shape, targets: np.ndarray, count: int) -> np.ndarray:
     targets: unit directions, (m, 3).
     """
     order, centres, radii = _tiles(shape)
-    # |c - t|² of the nearest target; rounding, 1e-8 of a chord, is within what `bounds` adds to a radius.
+    # |c - t|² of the nearest target; rounding, 1e-8 of a chord, is less than `bounds` adds to a radius.
     chord = np.sqrt(np.maximum((centres**2).sum(1) + 1 - 2 * (centres @ targets.T).max(1), 0))
     # The texels of these tiles are enough, and so nothing beyond the farthest of theirs is among the nearest.
     farthest = np.sort(chord + radii, kind="stable")[min(-(-count // TEXELS) + 1, len(chord)) - 1]
@@ -40,7 +40,7 @@ def _tiles(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     it (n,)."""
     order = shape.tiled()
     order = np.pad(order, (0, -len(order) % TEXELS), mode="edge").reshape(-1, TEXELS)
-    # c·d has no least value inside a tile around c, along rows or columns, while it is positive: its corners tell.
+    # c·d has no minimum inside a tile around c, along rows or columns, while it is positive: its corners decide.
     small = not any(n % 8 for n in shape.dims[-2:]) and (not shape.latlong or shape.size >= 32)
     seen = order[:, CORNERS] if small else order
     part = PART // TEXELS

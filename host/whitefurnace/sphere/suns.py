@@ -157,7 +157,7 @@ def _extracted(
     towards = source_directions(env, held)
     centre = towards @ (level[held] * weights[held])
     centre /= np.linalg.norm(centre)
-    # The sky beside it: what is not the sun, within some texels of its edge.
+    # The sky next to it: texels that are not the sun, near its edge.
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
     edge = math.acos(min(1.0, float((centre @ towards).min()))) + BESIDE * texel
     beside = np.setdiff1d(around[centre @ source_directions(env, around) >= math.cos(edge)], held)

@@ -57,7 +57,7 @@ def fit(truth: np.ndarray, down: np.ndarray, across: np.ndarray, counted: np.nda
             best, least = texels, float(off.max())
         if least == 0:
             break
-        # A fourth root, and no less than a twentieth, so that what errs little is not forgotten.
+        # A fourth root, and at least a twentieth, so that rows with small errors keep some weight.
         wy[counted] *= np.maximum(off.max(1) / off.max(), 0.05) ** 0.25
         wx *= np.maximum(off.max(0) / off.max(), 0.05) ** 0.25
     return best

@@ -188,7 +188,7 @@ def smith(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, A
     values = room_for(shape, run.precision, run.out)
     values[...] = found.reshape(shape)
     held = np.asarray(values, np.float64).ravel()
-    # Told of points between those that were fitted too, from the coefficients as they are written.
+    # The error is also measured at points between those that were fitted, from the coefficients as they are written.
     c2, x2, A2, more = exact(lambda axis: (np.arange(2 * axis.count) + 0.37) / (2 * axis.count))
     powers2 = x2[:, None] ** np.arange(shape[1])
     error = max(float(np.abs(off(held, c, powers, A)).max()), float(np.abs(off(held, c2, powers2, A2)).max()))

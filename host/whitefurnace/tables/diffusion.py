@@ -212,7 +212,7 @@ def _ratio(found: Profile, radii: np.ndarray, x: np.ndarray, share: np.ndarray, 
     """
     q = found.line_spread(2 * radii[:, None] * np.sin(x / 2))
     D = np.einsum("cx,rxk->rck", share, q, optimize=True) / np.einsum("x,rxk->rk", weights, q)[:, None]
-    return np.asarray(np.maximum(D, 0))  # a mean of what is nowhere negative, but for rounding
+    return np.asarray(np.maximum(D, 0))  # a mean of values that are not negative, except by rounding
 
 
 def _rule(NoL: np.ndarray, halvings: int, nodes: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -109,7 +109,7 @@ def glass(
     left = tolerance - (LOST if part.precision == 32 else 0.0)
     values = room_for((*grid.shape, 2), precision, out)
     flat, totals = values.reshape(grid.size, 2), Totals()
-    # Of light from the denser side the kernel gives what refraction takes from all that F = 1 would reflect.
+    # For light from the denser side the kernel gives the share of the F = 1 reflection that is refracted instead.
     whole, error = None, 0.0
     if (n < 1).any():
         plain = {name: value for name, value in columns.items() if name not in ("ior", "fresnel_ior")}

@@ -125,7 +125,7 @@ class Lobes:
                 self.precision,
                 [np.int32(EXACT[0]), polar, np.int32(EXACT[1]), azimuthal],
             )[0]
-        return np.minimum(found, 2.0)  # no more can be, but for what nodes leave of lobes far apart
+        return np.minimum(found, 2.0)  # the largest possible value; sums over nodes exceed it for lobes far apart
 
 
 def horizon(N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -362,7 +362,7 @@ def _stated(m: np.ndarray) -> dict[str, float]:
 
 def _stored(N: np.ndarray, kind: str) -> np.ndarray:
     """Return matrices after a round trip through a format."""
-    with np.errstate(over="ignore"):  # what is infinite is no lobe
+    with np.errstate(over="ignore"):  # an infinite value is no lobe
         return N.astype(kind).astype(np.float64)
 
 

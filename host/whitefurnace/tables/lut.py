@@ -210,7 +210,7 @@ def _made(
         facts.update(found)
         if request.as_read:
             facts["as_read"] = _as_read(request, replace(run, out=None, progress=None), out)
-        made.append(replace(result, values=np.empty(0)))  # the file has them; what is held would keep it mapped
+        made.append(replace(result, values=np.empty(0)))  # the file has them; an array here would keep it mapped
 
     with Transaction() as transaction:
         if request.form == ".npy":

@@ -124,7 +124,7 @@ def plan(request: TableRequest) -> TablePlan:
     path = Path(request.path)
     _check_file(kind, path, request.precision)
     tolerance = _tolerance(kind, request)
-    # Chosen once: a user's file is read once, and what was read is what the key is of.
+    # Chosen once: a user's file is read once, so the key is that of the text that is used.
     models = {slot: chosen(slot, spec) for slot, spec in kind.specs(request).items()}
     fixed = {name: number(name, value) for name, value in (request.parameters or {}).items()}
     size = size_of(kind.size if request.size is None else request.size)

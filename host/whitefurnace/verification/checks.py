@@ -133,7 +133,7 @@ def _slots_of(path: str) -> list[str]:
         except InputError as error:
             reasons.append(str(error))
     if not defined:
-        raise InputError("; ".join(dict.fromkeys(reasons)))  # what is wrong with both is said once
+        raise InputError("; ".join(dict.fromkeys(reasons)))  # a fault of both is reported once
     return defined
 
 
@@ -305,7 +305,7 @@ class Bench:
         )
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             error = value - expected if bound == "most" else expected - value if bound else np.abs(value - expected)
-            error = np.where(value == expected, 0.0, error)  # infinities alike
+            error = np.where(value == expected, 0.0, error)  # equal infinities
             # Where nothing is tolerated: any excess fails, and the nearest to it is the worst.
             exact = np.where(error > 0, np.inf, error / (1 + np.abs(error)))
             share = np.where(tolerance > 0, error / np.maximum(tolerance, 1e-320), exact)
@@ -579,7 +579,7 @@ def _chi2(b: Bench) -> Iterator[Row]:
         slices = np.minimum((phi * (AZIMUTHAL / (2 * math.pi))).astype(int), AZIMUTHAL - 1)
         seen = np.bincount(bins * AZIMUTHAL + slices, minlength=share.size)
         expected = share.ravel() * DRAWS
-        fit = expected >= 5  # the usual least count of a cell; what is fewer is one cell together
+        fit = expected >= 5  # the usual smallest count of a cell; cells with fewer are merged
         o, e = np.append(seen[fit], seen[~fit].sum()), np.append(expected[fit], expected[~fit].sum())
         o, e = (o, e) if e[-1] >= 5 else (np.append(o[:-2], o[-2] + o[-1]), np.append(e[:-2], e[-2] + e[-1]))
         found[k], freedom[k] = float(((o - e) ** 2 / e).sum()), e.size - 1
@@ -972,7 +972,7 @@ def _lit(b: Bench) -> Iterator[Row]:
     around = _direction(np.linspace(-1, 1, 9)[:, None], np.linspace(0, 6, 9)).reshape(-1, 3)
     if any(np.ptp(b.model.reference["L"](around, **own)) > 0 for own in sets):
         return
-    # The same from everywhere: what is reflected is the directional albedo times it.
+    # The radiance is the same from everywhere: the directional albedo times it is reflected.
     ndf = next(m for m in models("ndf").values() if m.isotropic and "NDF_AREA" in m.provides)
     facets = Bench(Subject(ndf, ndf.name), b.precision, b.device)
     rough, NoV = {n: c[:, None] for n, c in facets.columns(_few).items()}, NOV[1:, None, None]

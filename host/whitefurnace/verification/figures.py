@@ -49,9 +49,9 @@ Numbers = Mapping[str, Any]
 
 TOLERANCE = 1e-5  # of the curves: less than a line is wide
 
-FINEST, COARSEST = 1e-8, 1e-5  # what the colours of an error map span: around a rounding of float32, 6e-8
+FINEST, COARSEST = 1e-8, 1e-5  # range of the colours of an error map: around a rounding of float32, 6e-8
 
-GUESSES = (0.1, 0.2, 0.4, 0.8)  # for a user's parameters where the rows tell no values: what a roughness may be
+GUESSES = (0.1, 0.2, 0.4, 0.8)  # values of a user's parameters where the rows have none: plausible ones of a roughness
 
 SLOPES = ((0.2, 0.2), (0.4, 0.1), (0.6, 0.03))
 
@@ -324,7 +324,7 @@ def _ndf_row(sheet: _Sheet, family: _Family) -> list[Panel]:
             axes.plot(theta, values / values.max(), color=colour)
         axes.set_ylim(0, 1.02)
         axes.set_rgrids([0.25, 0.5, 0.75, 1], ["", "0.5", "", "1"])
-        axes.set_title("D / its peak, over θ", x=0.1, y=1.0)  # beside the label of 0°
+        axes.set_title("D / its peak, over θ", x=0.1, y=1.0)  # next to the label of 0°
 
     def masking(axes: Axes) -> None:
         slots = {"ndf": entry, "masking": model("masking", SMITH)}
@@ -653,7 +653,7 @@ def _fresnel(sheet: _Sheet) -> Page:
         panels.append(partial(_against_schlick, sheet))
     if sheet.families()[0].parameter is not None:
         panels.append(partial(_fresnel_error, sheet))
-    # Presets have their legends in free corners; curves of any shape have them beside.
+    # Presets have their legends in free corners, other curves outside the axes.
     columns, after = (3, 0.4) if metals else (2, 1.75)
     rows = [panels[k : k + columns] for k in range(0, len(panels), columns)]
     return [
@@ -677,7 +677,7 @@ def _metal(sheet: _Sheet, name: str, numbers: Numbers, axes: Axes) -> None:
         axes.plot(np.degrees(INCIDENCE), values, color=colour, label=channel, linestyle=style)
     axes.set(title=name.replace("_", " "), ylim=(0, 1.03), ylabel="F")
     _degrees(axes)
-    strip = axes.inset_axes([0, 0.0, 1, 0.06])  # what it looks like
+    strip = axes.inset_axes([0, 0.0, 1, 0.06])  # the reflected colour
     even = np.stack([np.interp(np.linspace(0, math.pi / 2, 181), INCIDENCE, values) for values in F], -1)
     srgb = np.where(even <= 0.0031308, 12.92 * even, 1.055 * np.maximum(even, 0) ** (1 / 2.4) - 0.055)
     strip.imshow(np.clip(srgb, 0, 1)[None], aspect="auto")

@@ -29,7 +29,7 @@ ENTRY = Model(
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
-    # Kinks where the grooves begin to mask: a rule errs by up to this many times its change from the one before.
+    # Kinks where the grooves begin to mask: a rule's error is up to this many times its change from the one before.
     checks=Checks(reciprocal=True, slow_rules=32.0),
     notes={"follows roughness": False},
 )

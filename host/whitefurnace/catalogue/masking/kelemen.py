@@ -25,7 +25,7 @@ ENTRY = Model(
     parameters=(),
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
-    # A peak of 1/(v·h)² where both graze: a rule errs by up to this many times its change from the one before.
+    # A peak of 1/(v·h)² where both graze: the error of a rule is up to this many times its change from the one before.
     checks=Checks(reciprocal=True, slow_rules=8.0),
     notes={"follows roughness": False},
 )

@@ -12,7 +12,7 @@ PRESET = Preset(
         facts="its WASM build rendered STEM_ibl.ktx with its harmonics, its least r .089; skybox, table and desktop "
         "builds were not tried",
         proven=True,
-        # A level more than its own tool makes: what is read between levels errs by .6 to .7 of that.
+        # One level more than its own tool makes, which reduces the error of reads between levels to .6 to .7.
         bend="alpha * alpha",
         least=0.045,
         min_size=8,
