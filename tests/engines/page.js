@@ -21,6 +21,16 @@ const post = (path, answer) => fetch(path, { method: "POST", body: JSON.stringif
 addEventListener("error", (event) => post("/failed", { error: `${event.message} ${event.filename}:${event.lineno}` }));
 addEventListener("unhandledrejection", (event) => post("/failed", { error: String(event.reason?.stack ?? event.reason) }));
 
+// Runs the steps that `whitefurnace engines` prints, as they are printed: imports, then statements over the names given,
+// with the file that they load, 'STEM…', at `url`.
+export async function follow(steps, url, given) {
+  const lines = steps.map((line) => line.replace(/'STEM[^']*'/, JSON.stringify(new URL(url, location).href)));
+  const first = lines.filter((line) => line.startsWith("import ")), rest = lines.filter((line) => !line.startsWith("import "));
+  const text = `${first.join("\n")}\nexport async function run(${Object.keys(given)}) {\n${rest.join("\n")}\n}`;
+  const module = await import(URL.createObjectURL(new Blob([text], { type: "text/javascript" })));
+  await module.run(...Object.values(given));
+}
+
 // OpenGL's rows go up.
 export function flipped(pixels, size) {
   const out = new Float32Array(pixels.length), row = 4 * size;

@@ -511,6 +511,7 @@ def engine(request, node_modules, baked, tmp_path_factory) -> Rendered:
                     **scene.job,
                     "name": f"{file}{k}",
                     "environment": f"/files/{files[file].name}",
+                    "steps": preset.steps,  # as they are printed
                     "glb": f"/files/{geometry.name}",
                 }
             )

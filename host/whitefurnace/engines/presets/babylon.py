@@ -34,6 +34,10 @@ PRESET = Preset(
         shading="babylon",
         sheen="Charlie under Neubelt's V, its table's third channel, in the light of the specular chain",
         file=(File("specular", "{stem}.env", "rgbd"), File("dfg", "{stem}_dfg.png", "rgbd")),
-        steps=("scene.environmentTexture = CubeTexture.CreateFromPrefilteredData('STEM.env', scene)",),
+        steps=(
+            "import { CubeTexture } from '@babylonjs/core/Materials/Textures/cubeTexture.js'",
+            "import '@babylonjs/core/Materials/Textures/Loaders/envTextureLoader.js'",
+            "scene.environmentTexture = CubeTexture.CreateFromPrefilteredData('STEM.env', scene)",
+        ),
     ),
 )

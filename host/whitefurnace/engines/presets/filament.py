@@ -26,10 +26,15 @@ PRESET = Preset(
             File("sh", "{stem}_sh.txt"),
             File("dfg", "{stem}_dfg.ktx2", "rgba16f", 19),
         ),
+        # JavaScript, since that is rendered by a test. The light that createIblFromKtx1 makes there has no harmonics.
         steps=(
-            "ibl = engine.createIblFromKtx1(STEM_ibl.ktx); engine.createSkyFromKtx1(STEM_skybox.ktx)",
-            "its harmonics too, in JavaScript: IndirectLight.Builder().reflections(ibl.getReflectionsTexture())"
+            "const bytes = async url => new Uint8Array(await (await fetch(url)).arrayBuffer())",
+            "const ibl = engine.createIblFromKtx1(await bytes('STEM_ibl.ktx'))",
+            "const light = Filament.IndirectLight.Builder().reflections(ibl.getReflectionsTexture())"
             ".irradianceSh(3, ibl.shfloats).build(engine)",
+            "scene.setIndirectLight(light)",
+            "// the background: scene.setSkybox(engine.createSkyFromKtx1(await bytes('STEM_skybox.ktx')))",
+            "// in C++: ktxreader::Ktx1Reader::createTexture for both, and getSphericalHarmonics for irradiance(3, …)",
         ),
     ),
 )

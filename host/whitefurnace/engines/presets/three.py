@@ -27,15 +27,17 @@ PRESET = Preset(
         ),
         # KTX2Loader of r187 refuses BC6H, which loses 8 % in small levels, and makes a 2-D texture of other cubes.
         steps=(
-            "const { mipmaps, format, type } = await ktx2Loader.loadAsync('STEM.ktx2')",
+            "import { CompressedCubeTexture, LinearFilter, LinearMipmapLinearFilter } from 'three'",
+            "import { KTX2Loader } from 'three/addons/loaders/KTX2Loader.js'",
+            "const { mipmaps, format, type } = await new KTX2Loader().detectSupport(renderer).loadAsync('STEM.ktx2')",
             "const faces = [0, 1, 2, 3, 4, 5].map(f => ({ width: mipmaps[0].width, height: mipmaps[0].height, "
             "mipmaps: mipmaps.map(({ data, width, height }) => ({ width, height, "
             "data: data.subarray(f * data.length / 6, (f + 1) * data.length / 6) })) }))",
-            "texture = new CompressedCubeTexture(faces, format, type); texture.minFilter = "
-            "LinearMipmapLinearFilter; texture.magFilter = LinearFilter; texture.isPMREMTexture = true; "
-            "texture.needsUpdate = true",
-            "scene.environment = texture; its last level is the diffuse light too",
-            "before r187: scene.environment = the texture of RGBELoader for STEM.hdr, which it filters itself",
+            "const texture = new CompressedCubeTexture(faces, format, type)",
+            "Object.assign(texture, { minFilter: LinearMipmapLinearFilter, magFilter: LinearFilter, "
+            "isPMREMTexture: true, needsUpdate: true })",
+            "scene.environment = texture // its last level is the diffuse light too",
+            "// before r187: scene.environment = the texture of RGBELoader for STEM.hdr, which it filters itself",
         ),
     ),
 )
