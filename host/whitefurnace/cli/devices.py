@@ -24,7 +24,7 @@ EPILOG = "\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 one works, 4 non
 def devices(as_json: bool) -> None:
     """List the OpenCL devices. The verdict comes from a small program that is built and run on each device and whose
     result is checked."""
-    from whitefurnace.opencl.device import INSTALL, find_devices
+    from whitefurnace.opencl.device import advice, find_devices
 
     found = find_devices()
     for candidate in found if as_json else ():
@@ -32,7 +32,8 @@ def devices(as_json: bool) -> None:
     if found and not as_json:
         click.echo(devices_text(found))
     if not any(candidate.works for candidate in found):
-        raise DeviceError(f"no OpenCL device {'works' if found else 'was found'}: {INSTALL}")
+        why = "".join(f"; {candidate.name}: {candidate.verdict}" for candidate in found)
+        raise DeviceError(f"no OpenCL device {'works' if found else 'was found'}{why}{advice()}")
 
 
 def devices_text(found: Sequence[Candidate]) -> str:

@@ -25,6 +25,7 @@ import numpy as np
 
 from whitefurnace.catalogue.user_text import MARK
 from whitefurnace.errors import DeviceError, InputError, UnsupportedError, UsageError
+from whitefurnace.opencl.cache import KernelCache, kernel_cache
 from whitefurnace.opencl.complaints import about_user_file
 
 # pyopencl takes 0.1 to 0.3 s to import, so it is imported by `_opencl()` at the first use of a device.
@@ -177,18 +178,34 @@ def _exposed_runtimes() -> Iterator[None]:
             del os.environ["OCL_ICD_VENDORS"]
 
 
-def _provide_cache() -> None:
-    """Give the compilers a temporary cache where the user's cannot be written: PoCL fails without one."""
+@contextlib.contextmanager
+def _exposed_cache() -> Iterator[None]:
+    """Let PoCL, while it is loaded, see the folder whose kernels this process has checked."""
+    global _cache
+    if _cache is None:
+        _cache = kernel_cache()
+    before = os.environ.get("POCL_CACHE_DIR")
+    if _cache is not None:
+        os.environ["POCL_CACHE_DIR"] = str(_cache.folder)
     try:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser())
-        home.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=home):
-            return
-    except (OSError, RuntimeError):
-        with contextlib.suppress(OSError):
-            folder = tempfile.TemporaryDirectory(prefix="whitefurnace-cache-", ignore_cleanup_errors=True)
-            atexit.register(folder.cleanup)
-            os.environ["XDG_CACHE_HOME"] = folder.name
+        yield
+    finally:
+        if before is not None:
+            os.environ["POCL_CACHE_DIR"] = before
+        elif _cache is not None:
+            del os.environ["POCL_CACHE_DIR"]
+
+
+class _Invokers(dict[Any, Any]):
+    """The code with which pyopencl calls kernels, kept in memory.
+
+    pyopencl keeps it in a database on disk, and runs what it finds there: a damaged one raises errors of any kind.
+    Making the code takes half a millisecond a kernel.
+    """
+
+    def store_if_not_present(self, key: Any, value: Any) -> None:
+        """Keep `value`, as pyopencl's database does."""
+        self.setdefault(key, value)
 
 
 def _opencl() -> Any:
@@ -196,6 +213,13 @@ def _opencl() -> Any:
     _refuse_after_fork()
     import pyopencl
 
+    if "pyopencl.invoker" not in sys.modules:
+        before = getattr(pyopencl, "_PYOPENCL_NO_CACHE", False)
+        pyopencl._PYOPENCL_NO_CACHE = True  # else the import opens the database
+        import pyopencl.invoker
+
+        pyopencl.invoker.invoker_cache = _Invokers()  # type: ignore[assignment]
+        pyopencl._PYOPENCL_NO_CACHE = before
     return pyopencl
 
 
@@ -231,6 +255,7 @@ if hasattr(os, "register_at_fork"):
 
 _lock = threading.RLock()
 _listed: list[Any] | None = None
+_cache: KernelCache | None = None
 _chosen: dict[tuple[int, str], Device] = {}
 
 
@@ -261,16 +286,14 @@ def _list_devices() -> list[Any]:
         if _listed is None:
             with _quiet():
                 try:
-                    _provide_cache()
                     cl = _opencl()
-                    with _exposed_runtimes():
-                        platforms = cl.get_platforms()
+                    with _exposed_cache(), _exposed_runtimes():
+                        found: list[tuple[Any, Any]] = []
+                        for platform in cl.get_platforms():
+                            with contextlib.suppress(Exception):  # a driver without a device may raise
+                                found += [(_preference(raw), raw) for raw in platform.get_devices()]
                 except Exception:  # ImportError, or a loader without a platform
                     return []
-                found: list[tuple[Any, Any]] = []
-                for platform in platforms:
-                    with contextlib.suppress(Exception):  # a driver without a device may raise
-                        found += [(_preference(raw), raw) for raw in platform.get_devices()]
             _listed = [raw for _, raw in sorted(found, key=lambda pair: pair[0])]
         return _listed
 
@@ -378,8 +401,18 @@ def choose_device(name: str | None = None) -> Device:
     if not listed:
         refused = ["no OpenCL platform was found"]
     raise DeviceError(
-        f"no OpenCL device {'called ' + repr(name) + ' ' if name else ''}works: {'; '.join(refused)}; {INSTALL}"
+        f"no OpenCL device {'called ' + repr(name) + ' ' if name else ''}works: {'; '.join(refused)}{advice()}"
     )
+
+
+def advice() -> str:
+    """Return the end of an error message where no device works: what to install, unless the cache has no room."""
+    try:
+        if _cache is not None:
+            _cache.check_room()
+    except DeviceError:
+        return ""
+    return f"; {INSTALL}"
 
 
 def identities_in_use() -> list[dict[str, str]]:
@@ -516,6 +549,7 @@ class Device:
         self.driver: str = raw.driver_version.strip()
         self.version: str = raw.version.strip()
         self.type: str = _kind(raw)
+        self._is_pocl = _platform_names(raw).endswith(" pocl")
         self.max_allocation = int(raw.max_mem_alloc_size)
         self.global_memory = int(raw.global_mem_size)
         self.seconds = 0.0
@@ -602,10 +636,14 @@ class Device:
         key = (text, " ".join(flags))
         with self._lock:
             if key not in self._programs:
+                if _cache is not None and self._is_pocl:
+                    _cache.check_room()
                 with _quiet() as noise:
                     failure = None
                     try:
-                        raw = cl.Program(self._context, text).build(flags, devices=[self._raw])
+                        # Drivers without a cache of their own are given pyopencl's.
+                        folder = str(_cache.folder / "pyopencl") if _cache is not None else None
+                        raw = cl.Program(self._context, text).build(flags, devices=[self._raw], cache_dir=folder)
                     except (cl.Error, OSError) as error:
                         failure = error
                 if failure is not None:
@@ -746,3 +784,5 @@ def _drain() -> None:
     for device in list(_live):
         with contextlib.suppress(Exception):
             device.finish()
+    if _cache is not None and _lost is None:
+        _cache.close()
