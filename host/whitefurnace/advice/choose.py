@@ -66,8 +66,10 @@ class _Candidate:
 
 @dataclass(frozen=True)
 class _Measured:
-    """A candidate with the RMS errors of its files and of the engine's picture; `short` is the larger of the two over
-    the tolerance, with the finest filter."""
+    """A candidate with the RMS errors of its files and of the engine's picture.
+
+    short  the larger of the two errors divided by the tolerance, with the finest filter
+    """
 
     candidate: _Candidate
     files: float
@@ -139,7 +141,7 @@ def choose(meter: ErrorMeter, tolerance: float, recipe: Chain) -> Choice:
 
 
 def _fixed(meter: ErrorMeter, engines: Sequence[Engine], tolerance: float, recipe: Chain) -> list[Entry]:
-    """The parts of the usual files that are over the tolerance and alike in every set."""
+    """Return the parts of the usual files whose error is above the tolerance and the same in every set."""
     storages = [Storage.of(engine) for engine in engines]
     return [
         e
@@ -165,7 +167,9 @@ def _measured(
 
 
 def _nearest(meter: ErrorMeter, usual_chain: Chain, seen: Iterable[_Measured]) -> tuple[_Measured, Chain] | None:
-    """The set that misses the tolerance by least, among those whose filter meets one of FILTERS."""
+    """Return the set that misses the tolerance by the smallest amount, among those whose filter meets one of
+    FILTERS.
+    """
     for one in sorted(seen, key=lambda one: one.short):
         if made := _certified(meter, one.candidate.recipe, usual_chain, FILTERS[::-1]):
             return one, made
@@ -173,7 +177,7 @@ def _nearest(meter: ErrorMeter, usual_chain: Chain, seen: Iterable[_Measured]) -
 
 
 def _certified(meter: ErrorMeter, one: Chain, usual_chain: Chain, tolerances: Sequence[float]) -> Chain | None:
-    """The chain with the first of the tolerances that its filter meets, None where it meets none of them."""
+    """Return the chain with the first of the tolerances that its filter meets, None where it meets none of them."""
     for tolerance in tolerances:
         made = replace(one, tolerance=tolerance, certify=usual_chain.certify)
         try:

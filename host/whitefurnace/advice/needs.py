@@ -290,8 +290,10 @@ class _Deciding:
             yield "skybox"
 
     def _table_size(self) -> int | None:
-        """Texels a side of the split-sum table where fewer than the engine's are enough, else None. Tables with an axis
-        of √n·v, and with Charlie's albedo, stay as they are, since they were not measured."""
+        """Return the texels on a side of the split-sum table where fewer than the engine's are enough, otherwise None.
+
+        Tables with an axis of √n·v, and with Charlie's albedo, keep their size, since smaller ones were not measured.
+        """
         larger = self.engine.holding("dfg") and self.engine.dfg.size > TABLE and self.engine.dfg.NoV == "centres"
         return TABLE if larger and not (self.sheens and self.engine.dfg.charlie) else None
 
@@ -397,7 +399,7 @@ class _Deciding:
         row("dfg", f"split-sum table, {size}²", "table", True, reason)
 
     def _sheen_channel(self) -> None:
-        """Adds a row for the albedo of a sheen in the engine's table, where the table or a material has one."""
+        """Add a row for the albedo of a sheen in the engine's table, where the table or a material has one."""
         engine, text = self.engine, _sheen_text(self.sheens)
         if engine.dfg.charlie and engine.holding("dfg"):
             left = "" if self.sheens else ", so the table's third channel is left out"
@@ -409,7 +411,7 @@ class _Deciding:
             self.rows.append(Need("Charlie's albedo in the table", "table", None, f"{text}, and {lacks}"))
 
     def _tables(self) -> Iterator[dict[str, Any]]:
-        """Options of `lut` for tables that the engine does not have, for users' own renderers."""
+        """Return options of `lut` for tables that the engine does not have, for users' own renderers."""
         free = self.engine.container != "files"
         clear = [m for m in self.lit if m["transmission"].most > 0]
         rough = [m for m in clear if m["roughness"].most > 0]
@@ -543,7 +545,7 @@ def _bytes(engine: Engine, recipe: Chain) -> int:
 
 
 def _parts(engine: Engine, recipe: Chain) -> dict[str, int]:
-    """Bytes of the files by their content."""
+    """Return the bytes of the files by their content."""
     texels = sum(6 * s * s for s, _ in recipe.levels)
     if engine.container == "npz":
         sizes = {"specular": 12 * texels, "irradiance": 72 * IRRADIANCE_SIZE**2, "sh": 108, "dfg": 8 * DFG_SIZE**2}

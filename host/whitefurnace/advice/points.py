@@ -136,7 +136,7 @@ def _fewer(values: np.ndarray, most: int) -> np.ndarray:
 
 
 def _left_out(scene: Scene, there: Sequence[int], least: float) -> list[str]:
-    """Notices about the parts of the lit materials `there` that the points do not have."""
+    """Return notices about the parts of the lit materials `there` that the points do not have."""
     found = []
     shaded = [scene.materials[k] for k in there]
     for name, what in (

@@ -116,7 +116,7 @@ class PointIntegrals:
 
     @cached_property
     def _once(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """R (m, 3) and E (m, 1) for F0 = 0, and how much each of them grows to F0 = 1."""
+        """Return R (m, 3) and E (m, 1) for F0 = 0, and how much each of them grows to F0 = 1."""
         m = len(self.sampled.roughness)
         R, E = np.empty((m, 2, 3)), np.empty((m, 2))
         for g in self.groups:

@@ -424,8 +424,10 @@ def status(request: BakePlan, k: int) -> Baked:
 
 
 def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: float) -> Baked | None:
-    """The item as its manifest states it, where that proves it whole and has the key of these source bytes: a skip
-    costs reading them, not decoding them."""
+    """Return the item as its manifest states it, if its files are complete and its key matches these source bytes.
+
+    The check reads the bytes of the source and does not decode them.
+    """
     item, stated = request.sources[k], (there or {}).get("source")
     if (
         request.force
@@ -674,7 +676,7 @@ def targets_of(request: BakePlan, name: str) -> list[Target]:
 
 
 def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
-    """The chains to make, equal ones once, and for each engine the places of its own and of Charlie's in them."""
+    """Return the distinct chains to make, and for each engine the indices of its own chain and of Charlie's."""
 
     def most(a: int | None, b: int | None) -> int | None:
         return None if a is None or b is None else max(a, b)  # None: all
@@ -718,9 +720,9 @@ def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
 def _rows_of(
     request: BakePlan, lit: Lighting, of: Sequence[tuple[int, int]], name: str
 ) -> list[tuple[Level, float | None, str, tuple[str, ...]]]:
-    """Each distinct level of `name`, a field of Filtered, from large to small and from smooth to rough.
+    """Return each distinct level of `name`, a field of Filtered, from large to small and from smooth to rough.
 
-    With it: the energy that it keeps (of "levels" alone), its NDF and the engines it is for.
+    Each comes with the energy that it keeps (only for "levels"), its NDF and its engines.
     """
     found: dict[int, tuple[Level, float | None, str, tuple[str, ...]]] = {}
     for e, engine in enumerate(request.engines):
@@ -830,7 +832,9 @@ def format_notices(manifest: Mapping[str, Any]) -> list[str]:
 def _would_read(
     request: BakePlan, env: Environment, device: Device | str | None, on: Device | None
 ) -> tuple[tuple[dict[str, Any], ...], tuple[str, ...]]:
-    """Errors after the engine's sampling of the planned chain and of others, and notices; empty without a device."""
+    """Return errors after the engine's sampling of the planned chain and of others, and notices; empty without a
+    device.
+    """
     try:
         on = on or choose_device(device if isinstance(device, str) else None)
     except DeviceError as error:
@@ -888,7 +892,7 @@ class EntryKey:
 
 @lru_cache(maxsize=4)
 def _table(device: Device, ndf: EntryKey) -> Integrated:
-    """The (scale, bias) table, read-only; it depends on the NDF and the device alone, not on the image."""
+    """Return the (scale, bias) table, read-only. It depends on the NDF and the device alone, not on the image."""
     table = dfg(DFG_SIZE, ndf=ndf.choice, tolerance=DFG_TOLERANCE, device=device)
     table.values.flags.writeable = False
     return table
@@ -901,8 +905,10 @@ def _split(device: Device, ndf: EntryKey, engine: Engine) -> SplitSum:
 
 
 def _key(digest: str, recipe: dict[str, Any]) -> str:
-    """sha256 over the source bytes, the canonical recipe (with the text of a user's NDF), all kernels, since tables and
-    derived numbers take many of them, and the version."""
+    """Return the sha256 of the source bytes, the recipe (with the text of a user's NDF), all kernels and the version.
+
+    All kernels count because tables and derived numbers use many of them.
+    """
     parts = [VERSION, digest, json.dumps(recipe, sort_keys=True), source.everything()]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 

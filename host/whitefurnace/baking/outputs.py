@@ -167,7 +167,7 @@ def _bytes(engine: Engine, path: Path, data: bytes, stated: Mapping[str, Any]) -
 
 
 def _format_loss(kept: np.ndarray, true: np.ndarray, mean: float) -> dict[str, float]:
-    """The error that a pixel format adds to a level: p99 and largest of its texel errors."""
+    """Return the error that a pixel format adds to a level: the 99th percentile and the largest of its texel errors."""
     off = texel_errors(kept.reshape(-1, 3).astype(np.float64), true.reshape(-1, 3).astype(np.float64), mean)
     return {"format_p99": float(np.quantile(off, 0.99)), "format_worst": float(off.max())}
 
@@ -312,7 +312,7 @@ def _irradiance(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
 
 
 def _octahedral(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
-    """Octahedral maps: mips of a texture, or one image of bordered levels, whose places the manifest states."""
+    """Return octahedral maps: mips of a texture, or one image of bordered levels, whose places the manifest states."""
     levels, coverage = made.chain.octahedral, made.chain.octahedral_coverage
     maps = [level.texels for level in levels]
     stated: dict[str, Any] = {"holds": file.holds, "format": file.stored, "layout": "octahedral", "border": file.border}
@@ -389,7 +389,7 @@ def _sh_file(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
 
 
 def _rgbd(levels: Sequence[Level], engine: Engine) -> tuple[list[np.ndarray], list[np.ndarray], int]:
-    """Levels turned to the engine's axes, what RGBD makes of them, and how many values it clips."""
+    """Return levels in the engine's axes, the same after a round trip through RGBD, and how many values it clips."""
     turned = [turned_cube(level.texels, engine.matrix) for level in levels]
     packed = [pack("rgbd", texels) for texels in turned]
     return (

@@ -200,7 +200,7 @@ def _seconds(device: Device, work: Work) -> float:
 
 
 def _enough(device: Device, make: Callable[[int], Work], least: float) -> Work:
-    """Work that takes the device at least `least` seconds a run, or the most there is."""
+    """Return work that takes the device at least `least` seconds per run, or the largest work there is."""
     scale, work = 1, make(1)
     while scale < 1 << 12:
         _seconds(device, work)  # builds, touches its memory for the first time
@@ -380,7 +380,7 @@ def _octahedral(device: Device, precision: int, scale: int) -> Work:
 
 
 def _samples(device: Device, precision: int, scale: int) -> Work:
-    """256 samples of the same lobe a texel, each between two levels of a pyramid of 256²."""
+    """256 samples of the same lobe per texel, each between two levels of a pyramid of 256²."""
     sampler = Sampler(Means(device, _rng().random((6, 256, 256, 3), np.float32), 0.0), precision)
     lobe, shape, pyramid = _ggx(device), Shape(False, min(8 * scale, 1024)), sampler.pyramid(256)
     return Work(
@@ -389,7 +389,7 @@ def _samples(device: Device, precision: int, scale: int) -> Work:
 
 
 def _truth(device: Device, precision: int, scale: int) -> tuple[Truth, Term, Points]:
-    """Points of a sphere under a noise, GGX at α = ¼ and Schlick's Fresnel of two F0."""
+    """Points of a sphere in random light, with GGX at α = ¼ and Schlick's Fresnel of two F0."""
     n = _directions(1024 * scale)
     n[2] = np.abs(n[2])
     return (
@@ -410,7 +410,7 @@ def _truth_samples(device: Device, precision: int, scale: int) -> Work:
 
 
 def _truth_lights(device: Device, precision: int, scale: int) -> Work:
-    """1 024 lights a point."""
+    """1 024 lights per point."""
     truth, found, points = _truth(device, precision, scale)
     count, lights = points.n.shape[1], np.concatenate([_directions(1024).T, _rng().random((1024, 3))], 1)
     return Work(
@@ -466,7 +466,7 @@ def _interpolate(device: Device, precision: int, scale: int) -> Work:
 
 
 def _near_texels(device: Device, precision: int, scale: int) -> Work:
-    """GGX at α = .005 in some directions over a lat-long of 64 rows, the list of its parts included."""
+    """GGX at α = .005 in some directions over a lat-long of 64 rows, including the list of its parts."""
     convolver, lobe = (
         Convolver(device, _noise(64), precision=precision),
         ndf_lobe(device, chosen("ndf", "ggx"), math.sqrt(0.005), {"alpha": 0.005}),
@@ -598,7 +598,7 @@ def _area(device: Device, precision: int, scale: int) -> Work:
 
 
 def _lobes(device: Device, precision: int, scale: int) -> Work:
-    """A step of the fit of linearly transformed cosines to GGX, of cosines as they are."""
+    """A step of the fit of linearly transformed cosines to GGX, beginning at the untransformed cosine."""
     slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith"), "fresnel": model("fresnel", "one")}
     rule, soft = LADDERS["gauss"][4], np.dtype(f"f{precision // 8}").type(0.02)
     cells = _cells((0, 1), (1, 1), (1, 1), (0, 0), (0, 0), (1, 1), (0.01, 1), count=1024 * scale)
@@ -697,7 +697,7 @@ def _harmonics(device: Device, precision: int, scale: int) -> Work:
 
 
 def _evaluate(device: Device, precision: int, scale: int) -> Work:
-    """GGX's D at cells of their own, more than the caches hold of them; after that the same again."""
+    """GGX's D at distinct cells, more than the caches hold."""
     kind, lanes = np.dtype(f"f{precision // 8}"), device.lanes(precision)
     step, again = lanes * device.local_size, max(scale // 256, 1)
     count = -(-16384 * min(scale, 256) // step) * step
@@ -716,7 +716,7 @@ def _evaluate(device: Device, precision: int, scale: int) -> Work:
 
 
 def _demo(device: Device, precision: int, scale: int) -> Work:
-    """Points of the built-in sky, 16 a texel."""
+    """Points of the built-in sky, 16 per texel."""
     rows, cuts = min(32 * scale, 2048), 4
     kernel = device.build(source.demo().text, {"W": 1, "T": 1, "PRECISION": 32}).kernel("demo")
     count = -(-2 * rows * rows // device.local_size) * device.local_size

@@ -132,7 +132,7 @@ def check(size: int, min_size: int) -> None:
 
 
 def _repeated(measure: Callable[[], Any], runs: int, budget: float) -> list[Any]:
-    """The results of `measure`, without the first."""
+    """Return the results of `measure` in repeated runs, without the first."""
     begin = time.perf_counter()
     found = [measure()]
     if time.perf_counter() - begin > budget:
@@ -236,7 +236,7 @@ class _One(Chain):
 
 
 def _level(env: Environment, device: Device, size: int, alpha: float, tolerance: float = COST_TOLERANCE) -> float:
-    """Seconds of one level alone, from texels in memory, without its certificate."""
+    """Measure the seconds of one level alone, from texels in memory, without its certificate."""
     recipe = _One(chain(size=size, min_size=size).ndf, size, size, tolerance, roughness=math.sqrt(alpha))
     begin = time.perf_counter()
     convolver = Convolver(device, env, precision=planning.precision_for(tolerance))

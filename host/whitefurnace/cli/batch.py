@@ -195,8 +195,10 @@ def _print_summary(summary: Summary, as_json: bool, quiet: bool) -> None:
 def _page(
     folder: Path | None, title: str, force: bool, summary: Summary, written: Callable[[Mapping[str, Any]], None] | None
 ) -> Iterator[Callable[[Any], None]]:
-    """The HTML page of a batch: gives a function that adds an item. The page is written also when the batch is stopped.
-    `written` is called with a row that names the page."""
+    """Open the HTML page of a batch and give a function that adds an item.
+
+    The page is written also when the batch is stopped. `written` is called with a row that names the page.
+    """
     if folder is None:
         yield lambda result: None
         return
@@ -214,7 +216,7 @@ def _page(
 
 @contextlib.contextmanager
 def _bar(summary: Summary, wanted: bool) -> Iterator[Callable[[], None]]:
-    """A bar on stderr, where that is a terminal: the rate, the time left and the number of failures."""
+    """Show a bar on stderr, where that is a terminal: the rate, the time left and the number of failures."""
     if not wanted or not sys.stderr.isatty():
         yield lambda: None
         return

@@ -203,7 +203,7 @@ def _tradeoff(
 
 
 def _spread(spread: Spread, factor: float, digits: int = 3) -> tuple[str, str]:
-    """The median times a factor as text, and the range as (least … largest)."""
+    """Return the median times a factor as text, and the range as (smallest … largest)."""
     median, low, high = (f"{float(f'{x * factor:.{digits}g}'):g}" for x in (spread.median, spread.low, spread.high))
     return median, f"({low} … {high})"
 

@@ -202,7 +202,9 @@ def _measure(
     as_json: bool,
     quiet: bool,
 ) -> dict[str, dict[str, Any]]:
-    """Print the error of each approximation in each environment; the options of the chosen bake by environment."""
+    """Print the error of each approximation in each environment; return the options of the chosen bake by
+    environment.
+    """
     from whitefurnace.advice import budget
 
     best = {}

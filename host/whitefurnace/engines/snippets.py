@@ -139,7 +139,7 @@ def _name(file: File, stem: str) -> str:
 
 
 def _rows(engine: Engine) -> File | None:
-    """The file that has the engine's harmonics."""
+    """Return the file that has the engine's harmonics."""
     if engine.sh is None:
         return None
     whole = (file for file in engine.holding("specular") if file.suffix in (".env", ".gltf"))
@@ -241,7 +241,7 @@ def _reads(to: _Writer, engine: Engine) -> None:
 
 
 def _octahedral(to: _Writer, engine: Engine, levels: int, width: int) -> None:
-    """The functions by which the maps of octamap.py are read: the mips of a texture, or an atlas of them."""
+    """Write the functions that read octahedral maps: the mips of a texture, or an atlas of them."""
     file = engine.holding("specular")[0]
     if file.layout != "octahedral":
         return
@@ -308,7 +308,7 @@ def _zero(formula: Expression) -> bool:
 
 
 def _least(engine: Engine) -> str:
-    """The roughness that is shaded with, where that is not r itself."""
+    """Return the expression of the roughness that the engine shades with; empty where it is r itself."""
     return f"max(r, {engine.least!r})" if engine.least else ""
 
 
@@ -356,7 +356,7 @@ def _sum(parts: Sequence[str]) -> str:
 
 
 def _times(factor: float, text: str) -> str:
-    """factor · text, without a factor of 1; in nine digits, more than float32 has."""
+    """Return factor · text, without a factor of 1; the factor has nine digits, more than float32."""
     return text if abs(factor - 1) < 1e-9 else f"({_literal(factor)} * {text})"
 
 

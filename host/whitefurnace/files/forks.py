@@ -9,8 +9,7 @@ import sys
 def _without_threads() -> None:
     """Let OpenEXR work without threads in a forked process.
 
-    Its pool belongs to the parent: its threads do not come along in a fork, and whoever waits for them waits without
-    end.
+    The threads of its pool belong to the parent and do not exist after a fork, so a wait for them would never end.
     """
     oiio = sys.modules.get("OpenImageIO")
     if oiio is not None:

@@ -139,8 +139,10 @@ class Output(ABC):
         return there
 
     def _renames(self, digests: Mapping[str, Any], ours: Mapping[str, Sequence[Any]]) -> list[tuple[Path, Path]] | None:
-        """The renames of staged files that make the output whole; None where a file is neither staged nor there, or
-        where a file that is not ours would be replaced."""
+        """Return the renames of staged files that complete the output.
+
+        None where a file is neither staged nor at its place, or where a file that is not ours would be replaced.
+        """
         renames = []
         for name, digest in digests.items():
             target = self.folder / name

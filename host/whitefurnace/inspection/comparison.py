@@ -397,7 +397,7 @@ def _symmetry(pairs: Sequence[tuple[Level, Level]]) -> list[str]:
 
 
 def _reduced(texels: np.ndarray) -> np.ndarray:
-    """Average square blocks of texels to at most 64² a face, in float64."""
+    """Average square blocks of texels to at most 64² per face, in float64."""
     n = texels.shape[1]
     step = next((k for k in range(1, n + 1) if n % k == 0 and n // k <= 64), n)
     return texels.reshape(6, n // step, step, n // step, step, 3).mean((2, 4), dtype=np.float64)

@@ -87,14 +87,14 @@ def quantiles(device: Device, entry: Model, numbers: np.ndarray, u: np.ndarray, 
 
 
 def _closed(device: Device, entry: Model, u: np.ndarray, numbers: np.ndarray, precision: int) -> np.ndarray:
-    """The NDF's own quantile at u, float64."""
+    """Return the NDF's own quantiles at u, float64."""
     below_one = np.minimum(u, 1 - (2.0**-24 if precision == 32 else 2.0**-53))  # float32 would round the rest to 1
     cells = np.concatenate([below_one[None], np.repeat(numbers, u.size, 1)])
     return evaluate(device, "NDF_SAMPLE", {"ndf": entry}, cells, precision)[0].astype(np.float64)
 
 
 def _energy(device: Device, entry: Model, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The energy below each of QUANTILES + 1 angles, from 0 to 1, and the angles."""
+    """Return the energy below each of QUANTILES + 1 angles, from 0 to 1, and the angles."""
     precision = finest(device)
     width, reach = (
         float(evaluate(device, f, {"ndf": entry}, numbers, precision)[0, 0]) for f in ("NDF_WIDTH", "NDF_REACH")

@@ -75,7 +75,7 @@ def _arcs(a: np.ndarray, b: np.ndarray, cell: np.ndarray, keep: np.ndarray) -> P
 
 
 def _rectangle(center: np.ndarray, u: np.ndarray, v: np.ndarray) -> Pieces:
-    """Counterclockwise about +z as azimuths are, where it faces the origin; edges are clipped at z = 0."""
+    """Return the edges of a rectangle, clipped at z = 0, counterclockwise about +z where it faces the origin."""
     size = np.abs(np.stack([center, u, v])).max((0, 2))[:, None]
     center, u, v = center / size, u / size, v / size
     facing = _dot(np.cross(u, v), center) < 0
@@ -101,7 +101,9 @@ def _rectangle(center: np.ndarray, u: np.ndarray, v: np.ndarray) -> Pieces:
 
 
 def _disc(center: np.ndarray, normal: np.ndarray, radius: np.ndarray) -> Pieces:
-    """The circle, from the side it shines to; what sets is replaced by the chord on the horizon."""
+    """Return the circle of a disc, seen from the side to which it shines; the part below the horizon becomes a chord
+    on it.
+    """
     size = np.maximum(np.abs(center).max(1), radius)
     center, radius, normal = center / size[:, None], radius / size, _unit(normal)
     facing = _dot(normal, center) < 0
@@ -179,7 +181,9 @@ def _nearest(pieces: Pieces, slopes: _Slopes) -> np.ndarray:
 
 
 def _scale(pieces: Pieces, slopes: _Slopes, t: np.ndarray) -> np.ndarray:
-    """The length in t over which the lobe, or the azimuth of n, changes: max(1, |slope|) over the slope's speed."""
+    """Return the length in t over which the lobe, or the azimuth of n, changes: max(1, |slope|) over the slope's
+    speed.
+    """
     h = 1e-6 * np.maximum(pieces.end - pieces.start, 1e-3)
     speed = np.linalg.norm(slopes.of(pieces.at(t + h)) - slopes.of(pieces.at(t - h)), axis=-1) / (2 * h)
     return np.hypot(1, np.linalg.norm(slopes.of(pieces.at(t)), axis=-1)) / np.maximum(speed, 1e-30)

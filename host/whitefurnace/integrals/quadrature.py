@@ -347,7 +347,7 @@ def _finite_array(name: str, given: Any) -> np.ndarray:
 
 
 def _view(given: Any, backfacing: str | None) -> np.ndarray:
-    """n·v in [0, 1], views from behind dealt with as asked; the rounding of a dot product is forgiven."""
+    """Return n·v in [0, 1]. Views from behind are treated as asked; the rounding of a dot product is accepted."""
     _finite_array("NoV", given)
     NoV = np.asarray(held(held(given, 0.0, 1.0), -1.0, 1.0) if backfacing is None else held(given, -1.0, 1.0))
     if backfacing is not None and backfacing not in BACKFACING:

@@ -149,7 +149,7 @@ def radiance(
 def _chosen(
     light: Spec | None, ndf: Spec | None, masking: Spec, fresnel: Spec, diffuse: Spec | None, brdf: Spec | None
 ) -> dict[str, Chosen]:
-    """The slots, filled; a perfectly smooth surface has its Fresnel alone."""
+    """Return the models by slot; a perfectly smooth surface has its Fresnel term alone."""
     smooth = ndf is None and diffuse is None and brdf is None
     slots = (
         {"fresnel": chosen("fresnel", fresnel)}
@@ -189,9 +189,9 @@ def radiance_spec(
 def _fill(
     task: _Task, how: Callable[[_Task, int, int], np.ndarray], components: int, out: np.ndarray | None
 ) -> np.ndarray:
-    """The values, made by `how` of some cells at a time as (components, n).
+    """Return the values, made by `how` for some cells at a time as (components, n).
 
-    Where the cells are RGB themselves (a preset, a colour), each takes its own of three components.
+    Where the cells themselves are RGB (a preset, a colour), each takes its own of three components.
     """
     grid = task.grid
     own = grid.rgb and components == 3
@@ -435,7 +435,7 @@ class _Outlined(Part):
 
 
 def _area(task: _Task, begin: int, end: int) -> np.ndarray:
-    """∫ over the light's outline, for a radiance of 1, times its own."""
+    """Return the integral over the light's outline for a radiance of 1, times its radiance."""
     light = task.light(begin, end)
     model = task.slots["light"].model
     _refuse_flat(model.name, light)
@@ -496,7 +496,9 @@ def _environment_of(
     out: np.ndarray | None,
     start: float,
 ) -> Integrated:
-    """Values (…, 3): the least radiance of each channel by the albedo, the rest over the texels' nodes."""
+    """Return values (…, 3): the smallest radiance of each channel times the albedo, plus the rest over the texels'
+    nodes.
+    """
     frame = frame_of((0.0, 1.0, 0.0) if normal is None else normal)
     env = environment(given, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
     texels = _Texels(task, env, frame)
@@ -539,7 +541,7 @@ def frame_of(normal: Sequence[float]) -> np.ndarray:
 
 
 class _Turned(Part):
-    """The whole BRDF, whose cells have an azimuth whatever its models."""
+    """The whole BRDF, whose cells always have an azimuth."""
 
     @property
     def view(self) -> tuple[str, ...]:
@@ -652,7 +654,7 @@ class _Texels:
         return total
 
     def _stride(self, count: int, precision: int) -> int:
-        """Nodes of a list, whole work items of STEPS vectors."""
+        """Return the number of nodes of a list in whole work items of STEPS vectors."""
         item = self.task.device.lanes(precision) * self._steps(count, precision) * self.task.device.local_size
         return -(-count // item) * item
 

@@ -214,7 +214,7 @@ def _default_lines(slots: Mapping[str, Model], isotropic: bool, tabled: bool) ->
 
 
 def _cell_lines(cells: Iterable[str], numbers: list[Declared], table: list[Declared]) -> list[str]:
-    """Define how a work item loads its cell: one row a number, first those named in `cells`."""
+    """Define how a work item loads its cell: one row for each number, first those named in `cells`."""
     rows = [*(f"cell_{name}" for name in cells), *(name for _, name in numbers)]
     loads = [f"const real {name} = LOAD(g, cell_values + (size_t){k} * cells);" for k, name in enumerate(rows)]
     if table:

@@ -303,7 +303,7 @@ def _label(raw: Any) -> str:
 
 
 def _platform_names(raw: Any) -> str:
-    """The name of a device's platform in lower case, and how its users call it."""
+    """Return the name of a device's platform in lower case, and the name that its users give it."""
     name = str(raw.platform.name).strip().lower()
     return f"{name} pocl" if name.startswith("portable computing language") else name
 
@@ -324,7 +324,7 @@ def _first_line(error: BaseException) -> str:
 
 
 def _try(raw: Any) -> tuple[Device | None, str]:
-    """The device, if a small program ran right on it, and the verdict."""
+    """Return the device, if a small program ran correctly on it, and the verdict."""
     key = (_list_devices().index(raw), os.environ.get("WHITEFURNACE_LANES", ""))
     with _lock:
         if key in _chosen:

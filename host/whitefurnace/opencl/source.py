@@ -406,7 +406,9 @@ def truth(slots: Mapping[str, Model], how: str, sets: int, area_terms: int = 0) 
 
 @_kept
 def convolution(ndf: Model | None) -> Source:
-    """Return the zonal convolution with the lobe of an NDF, or with the cosine lobe of irradiance for None."""
+    """Return the program of the zonal convolution with the lobe of an NDF, or with the cosine of irradiance for
+    None.
+    """
     return (
         assembled("convolution with the cosine") if ndf is None else assembled("convolution with an NDF", {"ndf": ndf})
     )
@@ -414,7 +416,7 @@ def convolution(ndf: Model | None) -> Source:
 
 @_kept
 def near_texels(kind: str, ndf: Model) -> Source:
-    """Return the exact integral of a narrow lobe over the texels near its direction.
+    """Return the program of the exact integral of a narrow lobe over the texels near its direction.
 
     kind: "latlong" or "cube", the form of the source.
     """
@@ -423,13 +425,13 @@ def near_texels(kind: str, ndf: Model) -> Source:
 
 @_kept
 def octahedral() -> Source:
-    """Return the zonal convolution by the symmetries of the cube, with any lobe."""
+    """Return the program of the zonal convolution by the symmetries of the cube, with any lobe."""
     return assembled("convolution by the symmetries of the cube")
 
 
 @_kept
 def apart(ndf: Model | None) -> Source:
-    """Return the excess of bright texels under the lobe of an NDF, or under the cosine of irradiance for None."""
+    """Return the program of the excess of bright texels under the lobe of an NDF, or under the cosine for None."""
     return (
         assembled("bright texels under the cosine")
         if ndf is None

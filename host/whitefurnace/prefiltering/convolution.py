@@ -159,8 +159,10 @@ class Convolver:
         error: float,
         share: tuple[float, ...],
     ) -> None:
-        """The lobe over the n × n grid and the list `bright`, part by part, into all of `level`; without the base where
-        it is of nodes."""
+        """Sum the lobe over the n × n grid and the list `bright`, part by part, into all of `level`.
+
+        The base is not added where the level is one of nodes.
+        """
         s, parts = self._symmetries, planning.parts_for(n, lobe.alpha, lobe.horizon)
         exchanges = 2 if shape.latlong else 6
         most = max(6 * part.work for part in parts)
@@ -367,7 +369,7 @@ class Convolver:
 
     @property
     def _harmonic_cuts(self) -> int:
-        """Nodes a texel edge for spherical harmonics to degree 2."""
+        """Return the nodes per texel edge for spherical harmonics to degree 2."""
         if self.texels.centred and self.texel <= 0.05:
             return 1
         return 2 * math.ceil(self.texel / 0.05)  # pairs of Gauss points on .05 rad: 2e-8 for these polynomials

@@ -72,7 +72,7 @@ class Sampler:
         return self.device.build(source.samples().text, {"W": lanes, "T": 1, "PRECISION": self.precision}).kernel(name)
 
     def _launch(self, name: str, count: int, *args: Any) -> None:
-        """A kernel of one lane over `count` items."""
+        """Launch a kernel of one lane over `count` items."""
         size = self.device.local_size
         self.device.launch(self._kernel(name, 1), (-(-count // size) * size,), args)
 
@@ -186,8 +186,10 @@ def light_samples(lobe: Lobe, count: int) -> tuple[np.ndarray, np.ndarray, np.nd
 
 
 def _energy(lobe: Lobe) -> tuple[np.ndarray, np.ndarray]:
-    """∫ |D| (n·h) sin θ_h dθ_h = ∫ |D|/2 d(sin²θ_h) below each of INTERVALS + 1 values of sin²θ_h in [0, ½], and these:
-    angles graded from the width of the lobe."""
+    """Return the energy of a lobe below each of INTERVALS + 1 values of sin²θ_h in [0, ½], and these values.
+
+    The energy is ∫ |D| (n·h) sin θ_h dθ_h = ∫ |D|/2 d(sin²θ_h). The angles are graded from the width of the lobe.
+    """
     width = min(lobe.alpha, 1.0)
     edges = np.linspace(0, math.asinh(math.pi / 4 / width), INTERVALS + 1)
     sin2 = np.minimum(np.sin(width * np.sinh(edges)) ** 2, 0.5)

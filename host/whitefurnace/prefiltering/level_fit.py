@@ -83,7 +83,7 @@ class _Lobes:
         return isinstance(other, _Lobes) and other.key == self.key
 
     def at(self, theta: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-        """K(θ) = D(θ/2) cos θ for θ in [0, π/2], (roughness, angles) float64, up to a factor a row."""
+        """Return K(θ) = D(θ/2) cos θ for θ in [0, π/2], (roughness, angles) float64, up to a factor for each row."""
         entry: Model = self.recipe.ndf.model
         rows = [self.recipe.parameters(float(r)) for r in roughness]
         if entry.reference:
@@ -125,8 +125,11 @@ def _disc(radius: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _within(radius: float, seen: np.ndarray, theta: np.ndarray) -> np.ndarray:
-    """(seen, θ): the share of the circle of radius θ around a direction, `seen` away from a disc's centre, that lies in
-    the disc: cos radius = cos seen cos θ + sin seen sin θ cos φ where it leaves."""
+    """Return the share of the circle of radius θ around a direction that lies in a disc, (seen, θ).
+
+    seen: angles of the direction from the disc's centre. The circle leaves the disc where cos radius = cos seen cos θ +
+    sin seen sin θ cos φ.
+    """
     cosine = (math.cos(radius) - np.cos(seen)[:, None] * np.cos(theta)) / (np.sin(seen)[:, None] * np.sin(theta))
     return np.arccos(np.clip(cosine, -1, 1)) / math.pi
 
@@ -265,8 +268,10 @@ def _constrained(
 
 
 def _mixture(c: np.ndarray, own: np.ndarray, allowed: np.ndarray, nodes: np.ndarray) -> Mixture:
-    """The weights of one level, rounded; what still falls below LEAST/2 of the own lobe is mixed with that until it
-    does not."""
+    """Return the weights of one level, rounded.
+
+    A mixture that falls below LEAST/2 of the own lobe is mixed with that lobe until it does not.
+    """
     c = c / c.sum()
     lobe = own @ allowed
     spare = c @ allowed - LEAST / 2 * lobe

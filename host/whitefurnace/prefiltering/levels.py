@@ -36,7 +36,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class _Task:
-    """A job with all that making its level needs.
+    """A job with everything that is needed to make its level.
 
     reference  exact values of its certificate; None where nothing is certified
     share      progress before and after the level, in [0, 1]

@@ -193,8 +193,11 @@ def _run(convolver: Convolver, jobs: Sequence[Job], tolerances: Sequence[float],
 def _distinct(
     convolver: Convolver, wants: Sequence[Want]
 ) -> tuple[list[Job], list[tuple[list[int], ...]], list[float]]:
-    """The distinct jobs of all chains; for each chain the indices of its cubes, lat-longs and octahedral maps; and the
-    tolerance of each job, the smallest of the chains that need it."""
+    """Return the distinct jobs of all chains, with their tolerances.
+
+    The second value has, for each chain, the indices of its cubes, lat-longs and octahedral maps. A job has the
+    smallest tolerance of the chains that need it.
+    """
     jobs: list[Job] = []
     tolerances: list[float] = []
     known: dict[Any, int] = {}

@@ -220,12 +220,14 @@ _kept_pieces = lru_cache(maxsize=LISTS)(_pieces)
 
 
 def _turns(columns: int) -> int:
-    """Quarter turns that bring the columns of a lat-long onto columns."""
+    """Return the number of quarter turns that map the columns of a lat-long onto columns."""
     return 4 if columns % 4 == 0 else 1
 
 
 def _generators(size: int, turns: int) -> int:
-    """Texels of a cube from which its symmetries give all: `generator_at` of `overlap.cl` numbers them."""
+    """Return the texels of a cube from which its symmetries give all others, as `generator_at` of `overlap.cl`
+    numbers them.
+    """
     upper, half = (size + 1) // 2, size // 2
     polar = size * size if turns == 1 else half * (size - half) + size % 2
     return (1 if turns == 4 else 4) * upper * size + polar

@@ -199,13 +199,13 @@ class Chain:
 
     @cached_property
     def all_levels(self) -> tuple[tuple[int, float], ...]:
-        """(size, perceptual roughness) of every level, including those that are not made."""
+        """Pairs (size, perceptual roughness) of all levels, including those that are not made."""
         n = self.count or int(math.log2(self.size // self.min_size)) + 1
         return tuple((max(self.size >> k, self.min_size), self.lods.roughness(k, n, self.size)) for k in range(n))
 
     @cached_property
     def levels(self) -> tuple[tuple[int, float], ...]:
-        """(size, perceptual roughness) of each level that is made."""
+        """Pairs (size, perceptual roughness) of the levels that are made."""
         return self.all_levels if self.only is None else self.all_levels[self.only[0] : self.only[1] + 1]
 
     @property
@@ -243,7 +243,10 @@ class Chain:
 
 
 def _smallest(size: int, min_size: int | None, levels: int | None, usual: int = MIN_SIZE) -> int:
-    """Face edge of the last level: as given, or what `levels` halvings leave, or the usual one. Raises UsageError."""
+    """Return the face edge of the last level: the one given, or that after `levels` halvings, or the usual one.
+
+    Raises UsageError.
+    """
     if levels is None:
         return usual if min_size is None else min_size
     low, high = LEVELS_RANGE

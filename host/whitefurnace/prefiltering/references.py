@@ -129,9 +129,10 @@ def _doubted(convolver: Convolver, todo: Sequence[Reference], tolerance: float) 
 
 
 def _detected(convolver: Convolver, one: Reference) -> float:
-    """Fraction of the reference grid's error that a check with the texels' cuts detects, 0 where it is too small.
+    """Return the fraction of the reference grid's error that a check with the texels' cuts detects.
 
-    Where a lobe has a kink, nodes at a spacing h err by h², of texels as well as of the grid.
+    It is 0 where the fraction is too small. Where a lobe has a kink, nodes at a spacing h have an error of h², for
+    texels as well as for the grid.
     """
     if not one.job.kinked:
         return 1.0

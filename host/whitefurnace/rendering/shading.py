@@ -226,7 +226,9 @@ def _scaled(
     NoV: np.ndarray,
     insulator: Any = DIELECTRIC,
 ) -> Weights:
-    """Filament: E · (1 + F0 (1/E₁ - 1)) with E₁ = A + B, the albedo for F0 = 1; the diffuse term gets 1 - E."""
+    """Weight as Filament does: E · (1 + F0 (1/E₁ - 1)) with E₁ = A + B, the albedo for F0 = 1; diffuse light gets 1
+    - E.
+    """
     F0 = insulator + (color - insulator) * metal
     E = F0 * A + B
     return E * (1 + F0 * (1 / (A + B) - 1)), color * (1 - metal) * (1 - E)
@@ -241,8 +243,11 @@ def _babylon(
     NoV: np.ndarray,
     insulator: Any = DIELECTRIC,
 ) -> Weights:
-    """Babylon.js 9: as Filament for the specular term. The diffuse term gets 1 - F0 of the light, whatever the specular
-    term takes, which is Babylon's default (LEGACY_SPECULAR_ENERGY_CONSERVATION)."""
+    """Weight as Babylon.js 9 does: the specular term as in Filament, the diffuse term with 1 - F0.
+
+    The diffuse weight does not depend on the specular term, which is Babylon's default
+    (LEGACY_SPECULAR_ENERGY_CONSERVATION).
+    """
     return _scaled(A, B, color, metal, r, NoV, insulator)[0], color * (1 - insulator) * (1 - metal)
 
 
@@ -255,7 +260,9 @@ def _fdez_aguera(
     NoV: np.ndarray,
     insulator: Any = DIELECTRIC,
 ) -> Weights:
-    """three.js and Bevy: [FdezAguera2019] for the dielectric and for the metal alone, mixed by metalness."""
+    """Weight as three.js and Bevy do: [FdezAguera2019] for the dielectric and for the metal alone, mixed by
+    metalness.
+    """
 
     def scattered(F0: Any) -> tuple[np.ndarray, np.ndarray]:
         once, lost, average = F0 * A + B, 1 - (A + B), F0 + (1 - F0) / 21
@@ -408,8 +415,10 @@ def _texels(path: Path, *, cube: bool) -> tuple[np.ndarray, ...]:
 
 
 def _maps(file: File, path: Path, manifest: Path) -> tuple[tuple[np.ndarray, ...], int]:
-    """Octahedral levels and the border around each: the mips of a texture, whose edges a sampler repeats, or those of
-    an atlas, as many as the manifest says. Raises InputError."""
+    """Return octahedral levels and the border around each. Raises InputError.
+
+    They are the mips of a texture, whose edges a sampler repeats, or those of an atlas, as many as the manifest states.
+    """
     if file.suffix != ".exr":
         levels = tuple(texels[..., :3] for texels in _texels(path, cube=False))
         if any(texels.shape[0] != texels.shape[1] for texels in levels):
@@ -595,7 +604,7 @@ def camera(shape: tuple[int, ...], band: slice = slice(None)) -> np.ndarray:
 
 
 def _behind(engine: Engine, lights: Lights, shape: tuple[int, ...], band: slice) -> np.ndarray:
-    """Level 0 as the camera sees it in the rows `band` of a picture."""
+    """Return level 0 as the camera sees it in the rows `band` of a picture."""
     d = stored_directions(engine, camera(shape, band))
     return level(lights.levels[0], d, lights.border).reshape(-1, shape[1], 3)
 

@@ -220,7 +220,7 @@ class Spheres:
         return pictures, extras, max(counts), max(estimates), found
 
     def _lost(self, roughness: float) -> np.ndarray:
-        """1/E₁ - 1, (m,); 0 where multiple scattering is not given back."""
+        """Return 1/E₁ - 1, (m,); 0 where multiple scattering is not restored."""
         if not self.material.multiscatter or roughness == 0:
             return np.zeros(self.points.n.shape[1])
         one = term(ndf=self.material.ndf, masking=self.material.masking, roughness=roughness)
@@ -293,7 +293,7 @@ class Spheres:
 
 
 def _facing() -> Points:
-    """One point whose normal is the view direction."""
+    """Return one point whose normal is the view direction."""
     up = np.array([[0.0], [0.0], [1.0]])
     return Points(up, up)
 

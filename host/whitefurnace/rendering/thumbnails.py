@@ -163,8 +163,10 @@ def _of_latlong(texels: np.ndarray) -> np.ndarray:
 
 
 def _reduced(texels: np.ndarray) -> np.ndarray:
-    """A cube of at most FACE texels of a face edge, by means of four. NaN becomes 0, and infinite values the largest
-    finite one."""
+    """Return a cube with a face edge of at most FACE texels, by means of four.
+
+    NaN becomes 0, and infinite values become the largest finite one.
+    """
     texels = np.asarray(texels, np.float32)
     finite = np.isfinite(texels)
     if not finite.all():

@@ -434,7 +434,7 @@ class _Reading:
     def _mesh(
         self, mesh: dict[str, Any], m: int, used: dict[int, list[dict[str, Any]]]
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """The box of a mesh, None where it has no positions; notes its primitives under their materials."""
+        """Return the box of a mesh, None where it has no positions, and note its primitives under their materials."""
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for p, primitive in enumerate(
             self.take.array(mesh.get("primitives"), f"primitives of mesh {m}", 1, MAX_PRIMITIVES)
@@ -506,7 +506,9 @@ class _Reading:
             raise self.wrong(f"its materials or textures are not as glTF has them ({str(error)[:100]})") from None
 
     def _holder(self, k: int, extension: str) -> tuple[Any, str]:
-        """What holds values of a material: a dictionary or an object of pygltflib, None where it has none."""
+        """Return the object that holds values of a material: a dictionary or an object of pygltflib, None where it
+        has none.
+        """
         if k < 0:
             return None, "the default material"
         material, what = self.typed.materials[k], f"material {k}"
@@ -541,7 +543,7 @@ class _Reading:
         return np.clip(found, p.low, p.high), "default" if np.array_equal(found, p.default) else "factor"
 
     def _property(self, k: int, p: Property, primitives: Sequence[dict[str, Any]]) -> Callable[[], Spread]:
-        """What gives the spread of a property, once the images were counted."""
+        """Return a function that gives the spread of a property, once the images were counted."""
         holder, what = self._holder(k, p.extension)
         factor, given = self._factor(holder, p, what)
         texture = self._texture(holder, p.texture, what, primitives) if p.texture and factor.any() else None
@@ -700,7 +702,9 @@ def _around(triangles: np.ndarray, wraps: tuple[int, int]) -> np.ndarray:
 
 
 def _tiles(boxes: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """Tiles (rows, columns) of the image, bool, that boxes touch, and their neighbours, which a filter reads too."""
+    """Return the tiles of the image that boxes touch, (rows, columns) bool, and their neighbours, which a filter
+    reads too.
+    """
     x0, y0 = (np.clip(np.floor(boxes[:, k] * n).astype(int) - 1, 0, n) for k, n in ((0, columns), (1, rows)))
     x1, y1 = (np.clip(np.floor(boxes[:, k] * n).astype(int) + 2, 0, n) for k, n in ((2, columns), (3, rows)))
     # The running sums of the boxes' corners along both axes count the boxes over a tile.
@@ -729,7 +733,7 @@ def _count(bands: Iterable[tuple[int, int, int, np.ndarray]], uses: Sequence[_Us
 
 
 def _spread(use: _Use, p: Property, base: np.ndarray, factor: np.ndarray) -> Spread:
-    """base + factor × what a texture holds."""
+    """Return the spread of base + factor × texture."""
     if use.counts is None:
         ends = np.sort(np.stack([base, base + factor]), axis=0)
         return Spread(tuple(ends[0].tolist()), tuple(ends[1].tolist()), (), "texture", seen=False)

@@ -251,8 +251,10 @@ def _judged(scene: Scene, pixel: Pixel | None, m: Material | None, medium: Mediu
 
 
 def _size(scene: Scene, m: Material | None) -> tuple[float | None, str]:
-    """The largest length that light crosses, and its name: a material's thickness, else the shortest side of the
-    scene's box."""
+    """Return the largest length that light crosses, and its name.
+
+    It is a material's thickness, otherwise the shortest side of the scene's box.
+    """
     if m is not None and m["thickness"].most > 0:
         return m["thickness"].most, "its thickness"
     sides = [side for side in scene.extent or () if side > 0]
@@ -265,7 +267,7 @@ def _ior(m: Material) -> float:
 
 
 def _file(material: str, taken: set[str]) -> str:
-    """A file name made from that of a material, which may contain any characters."""
+    """Return a file name made from the name of a material, which may contain any characters."""
     stem = "diffusion" + "".join(f"_{part}" for part in re.findall(r"[A-Za-z0-9-]+", material)[:8])
     name, k = f"{stem}.npy", 2
     while name.lower() in taken:

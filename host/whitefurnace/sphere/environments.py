@@ -249,7 +249,7 @@ _FRESH = 2_000_000_000  # ns: the coarsest times that file systems keep (FAT), a
 
 
 def _stamps(path: Path) -> tuple[tuple[int, ...], ...] | None:
-    """What changes when the files of a path are written to; None where they cannot be listed, as reading will say."""
+    """Return data that change when the files of a path are written to; None where they cannot be listed."""
     try:
         return tuple(
             (s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
@@ -540,7 +540,7 @@ def channel_range(texels: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float
 
 
 def _largest(values: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.float64]:
-    """The `count` largest of (n,) values, in no order; all of them where there are fewer."""
+    """Return the `count` largest of (n,) values, in no order; all of them where there are fewer."""
     if values.size > 2 * count * _RUN:
         # The count largest of the runs' maxima are as many values, so nothing below the least of them counts.
         tops = values[: values.size // _RUN * _RUN].reshape(-1, _RUN).max(axis=1)
@@ -549,7 +549,7 @@ def _largest(values: npt.NDArray[np.float64], count: int) -> npt.NDArray[np.floa
 
 
 def _direction(env: Environment, row: int, column: int) -> tuple[float, float, float]:
-    """Unit vector to the centre of a texel, with the rotation; rows of a cube run through its faces."""
+    """Return the unit vector to the centre of a texel, with the rotation; rows of a cube run through its faces."""
     height, width = env.texels.shape[-3:-1]
     if env.kind == "latlong":
         polar = (row + 0.5) * math.pi / height

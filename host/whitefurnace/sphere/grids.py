@@ -174,7 +174,7 @@ def octahedral_density(d: np.ndarray) -> np.ndarray:
 
 
 def _sign(x: np.ndarray) -> np.ndarray:
-    """1 at 0, either of them: an edge of the fold belongs to both of its sides."""
+    """Return the sign of values, 1 at 0: an edge of the fold belongs to both of its sides."""
     return np.where(x < 0, -1.0, 1.0)
 
 

@@ -223,14 +223,15 @@ def windowed(sh: np.ndarray, mode: str | float = "auto") -> Windowed:
 
 
 def _nearest(irradiance: np.ndarray, least: np.ndarray) -> np.ndarray:
-    """(..., 3): the "auto" window for coefficients of E/π (..., 9, 3) with their least values (..., 3).
+    """Return the "auto" window, (..., 3), for coefficients of E/π (..., 9, 3) with their smallest values (..., 3).
 
-    With f₀ the mean and f₁(n), f₂(n) the parts of degree 1 and 2 of a channel, the windows (w₁, w₂) that serve,
-    f₀ + w₁f₁(n) + w₂f₂(n) ≥ 0 for all n, are a convex set K that holds (0, 0). Along the ray w = ρ(cos φ, sin φ) it
-    ends at ρ = f₀ / -min(cos φ f₁ + sin φ f₂): one exact minimum, no search. Wanted is the point of K ∩ [0, 1]² that
-    is least in J = a(1 - w₁)² + b(1 - w₂)², a and b the bands' sums of squares. At the minimum's place n* the edge of
-    K has the normal (f₁(n*), f₂(n*)), which gives the sign of dJ/dφ along the edge. It changes once (J is convex and
-    K is), so φ is bisected; 26 turns leave 2e-8 of φ and its square of J, and K holds every turn's point exactly.
+    With f₀ the mean and f₁(n), f₂(n) the parts of degree 1 and 2 of a channel, the valid windows (w₁, w₂), f₀ + w₁f₁(n)
+    + w₂f₂(n) ≥ 0 for all n, are a convex set K that contains (0, 0). Along the ray w = ρ(cos φ, sin φ) it ends at ρ =
+    f₀ / -min(cos φ f₁ + sin φ f₂): one exact minimum, no search. The result is the point of K ∩ [0, 1]² with the
+    smallest J = a(1 - w₁)² + b(1 - w₂)², where a and b are the bands' sums of squares. At the place n* of the minimum
+    the edge of K has the normal (f₁(n*), f₂(n*)), which gives the sign of dJ/dφ along the edge. It changes once (J is
+    convex and K is), so φ is bisected; after 26 steps the error is 2e-8 of φ and its square of J, and the point of
+    every step lies exactly in K.
     """
     channels = np.swapaxes(irradiance, -1, -2)  # (..., 3, 9)
     mean = channels[..., 0] * FACTORS[0]
@@ -340,12 +341,12 @@ def filament(sh: np.ndarray) -> np.ndarray:
 
 
 def _from_polynomial() -> np.ndarray:
-    """(9, 9): our coefficients of the function that Babylon.js shades with, from the polynomial in a .env file.
+    """Return the matrix (9, 9) from the polynomial in a .env file to our coefficients of Babylon.js's shading function.
 
     Babylon does not evaluate the polynomial. SphericalHarmonics.FromPolynomial makes harmonics of it (Condon-Shortley
     sign, constants of six digits, copied here) and divides the cosine kernel out, 3/2 and 4 for degree 1 and 2; the
     shader then evaluates those harmonics as E/π, without a kernel (@babylonjs/core 9.35, materialHelper.functions,
-    harmonicsFunctions). Its own files agree, as FromHarmonics puts the kernel onto E/π a second time.
+    harmonicsFunctions). Its own files agree, since FromHarmonics applies the kernel to E/π a second time.
     """
     x, y, z, xx, yy, zz, yz, zx, xy = np.eye(9)
     rows = [

@@ -36,8 +36,10 @@ def nearest_texels(shape: Shape, targets: np.ndarray, count: int) -> np.ndarray:
 
 @lru_cache(maxsize=16)
 def _tiles(shape: Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Texels in tiles (n, TEXELS), the last filled up with its last texel; centre (n, 3) of each and largest chord to
-    it (n,)."""
+    """Return texels in tiles (n, TEXELS), the centre of each tile (n, 3) and the largest chord to it (n,).
+
+    The last tile is filled up with its last texel.
+    """
     order = shape.tiled()
     order = np.pad(order, (0, -len(order) % TEXELS), mode="edge").reshape(-1, TEXELS)
     # c·d has no minimum inside a tile around c, along rows or columns, while it is positive: its corners decide.

@@ -99,7 +99,7 @@ def _sum_by(owner: Ints, values: Floats, count: int) -> Floats:
 
 
 def _latlong_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size: int, flat: Ints) -> Floats:
-    """Rectangles in (φ, cos θ): the product of overlaps in θ and in φ."""
+    """Sum rectangles in (φ, cos θ): the product of overlaps in θ and in φ."""
     rows, columns = texels.shape[:2]
     ratio, shift = columns / (2 * size), rotation / (2 * math.pi) * columns
     out = np.empty((len(flat), 3))
@@ -118,7 +118,7 @@ def _latlong_from_latlong(texels: npt.NDArray[np.float32], rotation: float, size
 
 
 def _versine(tau: Floats) -> Floats:
-    """1 - cos θ of cot θ = tau, without the cancellation of the difference near θ = 0; tau ≥ -1, or inf."""
+    """Return 1 - cos θ for cot θ = tau, without the cancellation of the difference near θ = 0; tau ≥ -1, or inf."""
     with np.errstate(invalid="ignore"):
         root = np.sqrt(1 + tau * tau)
         value = 1 / (root * (root + tau))
@@ -427,7 +427,7 @@ def _regions(
 
 
 def _cube_on_cube(texels: npt.NDArray[np.float32], size: int, flat: Ints) -> Floats:
-    """Faces that are not turned: rectangles in (s, t), by Gauss nodes in s and exactly along t."""
+    """Sum the overlaps of faces with the same axes: rectangles in (s, t), by Gauss nodes in s and exactly along t."""
     n = texels.shape[1]
     out = np.empty((len(flat), 3))
     step = max(BLOCK // (n // size + 2) ** 2, 1)
@@ -465,8 +465,10 @@ def _places(n: int, face: Ints) -> Ints:
 
 
 def _cube_from_cube(texels: npt.NDArray[np.float32], rotation: float, size: int, flat: Ints) -> tuple[Floats, Floats]:
-    """Texel and solid angle of each, from the six source faces: in their planes a texel is the polygon that its
-    four side planes n·d ≥ 0 cut out."""
+    """Return the radiance and the solid angle of each texel, from the six source faces.
+
+    In the plane of a source face a texel is the polygon that its four side planes n·d ≥ 0 cut out.
+    """
     n, m = texels.shape[1], len(flat)
     face, rest = np.divmod(flat, size * size)
     i, j = np.divmod(rest, size)

@@ -63,7 +63,7 @@ class Axis:
         return np.where(share == 0, self.low, np.where(share == 1, self.high, values))
 
     def _indices(self, share: np.ndarray) -> np.ndarray:
-        """Indices of refraction at shares of an "f0" axis. The ends are exact."""
+        """Return indices of refraction at positions along an "f0" axis. The ends are exact."""
         low, high = (math.copysign(math.sqrt(abs(n - 1) / (n + 1)), n - 1) for n in (self.low, self.high))
         z = low + (high - low) * share
         indices = (1 + z * np.abs(z)) / (1 - z * np.abs(z))

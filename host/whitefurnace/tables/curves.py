@@ -243,7 +243,7 @@ def _smith_stated(cells: Cells, values: np.ndarray, error: float, pair: float) -
 
 
 def _pairs(scheme: str | None, k: np.ndarray, q: np.ndarray, c: np.ndarray, A: np.ndarray, x: np.ndarray) -> float:
-    """The largest error of the height-correlated G over pairs of directions at the same parameter."""
+    """Return the largest error of the height-correlated G over pairs of directions at the same parameter."""
     worst = 0.0
     for one in np.unique(x)[::4]:
         at = (x == one) & (c > 0)

@@ -113,7 +113,7 @@ def diffusion_spec(scheme: str | None, columns: Mapping[str, np.ndarray]) -> Tab
 
 
 def _parts(scheme: str | None, columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, Profile]:
-    """Cosines, curvatures and the profile."""
+    """Return cosines, curvatures and the profile."""
     others = {name: column for name, column in columns.items() if name not in AXES}
     for name, column in others.items():
         if column.ndim:

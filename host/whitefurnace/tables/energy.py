@@ -148,7 +148,9 @@ def energy(scheme: str, report: bool, **what: Any) -> tuple[Integrated, dict[str
 
 
 def _apart(values: np.ndarray) -> float:
-    """1 - min/max along x, at its largest: by how much f(l, v) and f(v, l) differ where one factor is of v alone."""
+    """Return the largest 1 - min/max along x: how much f(l, v) and f(v, l) differ where one factor depends on v
+    alone.
+    """
     high = values.max(-1)
     return float((1 - values.min(-1) / np.where(high > 0, high, 1)).max())
 
@@ -198,9 +200,11 @@ def fresnel_spec(models: Mapping[str, Chosen], columns: Mapping[str, Any]) -> Ta
 def _halved(
     F: Callable[[np.ndarray, np.ndarray], np.ndarray], count: int, rounding: float
 ) -> tuple[np.ndarray, float, int]:
-    """2∫ F μ dμ of `count` curves F(μ, which), the error left and the evaluations: panels of 10 Gauss nodes, halved
-    where their halves say otherwise, so that a kink (total reflection) is closed in upon;
-    `rounding` is that of F."""
+    """Return 2∫ F μ dμ of `count` curves F(μ, which), the remaining error and the number of evaluations.
+
+    Panels have 10 Gauss nodes and are halved where their halves differ, which closes in on a kink (total reflection).
+    rounding: the rounding error of F.
+    """
     x, w = gauss(10)
 
     def panel(low: np.ndarray, length: np.ndarray, which: np.ndarray) -> np.ndarray:

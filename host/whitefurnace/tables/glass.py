@@ -163,5 +163,5 @@ def _stated(shares: np.ndarray, scheme: str | None) -> dict[str, Any]:
 
 
 def _beside(values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Values over fewer parameters, by the axes of a grid over more, from the right."""
+    """Return values over fewer parameters in the shape of a grid over more, aligned at the right."""
     return values.reshape((1,) * (len(shape) - values.ndim) + values.shape)

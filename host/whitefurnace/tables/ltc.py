@@ -231,11 +231,10 @@ def _start(lobes: Lobes, width: np.ndarray) -> Fit:
 
 
 def _from_neighbours(lobes: Lobes, fit: Fit, shape: tuple[int, ...], width: np.ndarray, free: bool) -> None:
-    """Cells in worse valleys than a neighbour's start again from its matrix, for lobes of their own width, in place.
+    """Start cells in worse minima again from a neighbour's matrix, scaled to lobes of their own width, in place.
 
-    The neighbour's lobe is turned to the cell's own l̄, and with k the ratio of the widths M's columns x and y scale
-    by k.
-    Towards grazing a lobe is a wedge, whose y scales by k² and z by k.
+    The neighbour's lobe is turned to the cell's own l̄, and with k the ratio of the widths M's columns x and y scale by
+    k. Towards grazing a lobe is a wedge, whose y scales by k² and z by k.
     """
     index = np.arange(lobes.count).reshape(shape)
     rule, soft, _ = STAGES[-1]

@@ -236,8 +236,10 @@ def _made(
 
 
 def _at(request: TablePlan, run: Run, shares: Sequence[np.ndarray]) -> tuple[Any, ...]:
-    """Values at shares of x and y, (ny, nx, c) float64; the weights of reads there along y and x; the rows that count;
-    and what was integrated."""
+    """Return values at positions in x and y, (ny, nx, c) float64, with the weights of reads there.
+
+    Also returned are the rows whose errors count, and the integrals.
+    """
     points, weights = [], []
     for one, share in zip(request.axes, shares, strict=True):
         values, x = one.at(share)
@@ -251,7 +253,7 @@ def _at(request: TablePlan, run: Run, shares: Sequence[np.ndarray]) -> tuple[Any
 
 
 def _fitted(request: TablePlan, run: Run) -> tuple[Integrated, Facts]:
-    """Texels whose reads between the axes' ends are most accurate, in `run.out`."""
+    """Fit texels whose reads between the axes' ends are most accurate, into `run.out`."""
     out, plain = run.out, replace(run, out=None, progress=None)
     assert out is not None
     shares = [
@@ -265,7 +267,9 @@ def _fitted(request: TablePlan, run: Run) -> tuple[Integrated, Facts]:
 
 
 def _as_read(request: TablePlan, run: Run, out: np.ndarray) -> dict[str, Any]:
-    """Absolute errors at texel centres and of bilinear reads between them, from the table and as formats hold it."""
+    """Return absolute errors at texel centres and of bilinear reads between them, from the table and from each
+    format.
+    """
     texels = np.asarray(out, np.float64).reshape(request.axes[1].count, request.axes[0].count, -1)
     # At points where no fit looked, and at the ends.
     shares = [np.concatenate([[0.0], (np.arange(n) + 0.37) / n, [1.0]]) for n in (5 * a.count for a in request.axes)]

@@ -195,7 +195,9 @@ def _typical_only(p: Parameter) -> np.ndarray:
 
 
 def _drawn(p: Parameter, u: np.ndarray) -> np.ndarray:
-    """Values for u in [0, 1): evenly in a domain as [0, 1] or [0, 16], else by the logarithm, from 1e-6 of its end."""
+    """Return values for u in [0, 1): evenly in a domain such as [0, 1] or [0, 16], otherwise logarithmic from 1e-6
+    of its end.
+    """
     low = max(p.low, 1e-6 * p.high)
     even = p.high <= 20 if p.low <= 0 else p.high < 100 * p.low
     return p.low + (p.high - p.low) * u if even else low * (p.high / low) ** u
@@ -371,8 +373,10 @@ def _product(*axes: Any, columns: Columns) -> tuple[list[np.ndarray], Columns]:
 def _conditioned(
     reference: Callable[..., np.ndarray], arguments: Sequence[np.ndarray], columns: Columns, steps: Sequence[Any]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A reference, and by how much it changes when its arguments do by `steps` and its parameters by the last of them:
-    no kernel that computes in rounded numbers can do better."""
+    """Return a reference, and its change when its arguments change by `steps` and its parameters by the last of them.
+
+    No kernel that computes in rounded numbers can be more accurate than this change.
+    """
     with np.errstate(all="ignore"):
         want = np.asarray(reference(*arguments, **columns), np.float64)
         unsure = np.zeros(want.shape)
@@ -414,8 +418,7 @@ def _normalization(b: Bench) -> Iterator[Row]:
 
 
 def _views(b: Bench) -> dict[str, Any]:
-    """Keyword arguments that broadcast views before parameter sets: cells that climb a ladder together are then of
-    one view."""
+    """Return keyword arguments that broadcast views before parameter sets, so that neighbouring cells have one view."""
     if b.model.isotropic:
         return {"NoV": NOV[:, None]}
     return {"NoV": NOV[:, None, None], "phi": PHI[None, :, None]}
@@ -628,7 +631,7 @@ def _geometry(b: Bench) -> tuple[Columns, np.ndarray, np.ndarray]:
 
 
 def _any_ndf(b: Bench) -> dict[str, Model]:
-    """An NDF for the text of a masking that wants one."""
+    """Return an NDF for the text of a masking that needs one."""
     return (
         {"ndf": next(m for m in models("ndf").values() if m.isotropic and "NDF_AREA" in m.provides)}
         if b.model.needs
@@ -686,7 +689,7 @@ def _kernel_masking(b: Bench) -> Iterator[Row]:
 def _reciprocity(
     b: Bench, one: np.ndarray, other: np.ndarray, tolerance: Any, where: Mapping[str, Any], scale: Any
 ) -> Row:
-    """Equal under exchange of l and v where the entry says so; where it denies it, a difference must be seen."""
+    """Check that f is equal under exchange of l and v where the entry says so, and differs where it denies it."""
     if b.model.checks.reciprocal is not False:
         return b.row("reciprocity", one, other, tolerance, where)
     apart = np.abs(one - other) / scale
@@ -756,7 +759,7 @@ def _kernel_F(b: Bench) -> Iterator[Row]:
 
 
 def _limits(b: Bench) -> Iterator[Row]:
-    """The entry's exact values: arguments and value by the parameters, NaN where they say nothing."""
+    """Check the entry's exact values: arguments and value by the parameters, NaN where there is none."""
     own = {n: b.rounded(c) for n, c in b.columns(_between).items()}
     count = next((c.size for c in own.values()), 1)
     for name, limit in b.model.limits.items():
@@ -854,7 +857,7 @@ def _albedo(b: Bench) -> Iterator[Row]:
 
 
 def _random_pairs(b: Bench, count: int = 20000) -> tuple[np.ndarray, np.ndarray]:
-    """Directions all over the hemisphere, half of them grazing, some pairs mirrored: where lobes are."""
+    """Return directions all over the hemisphere, half of them grazing, with some mirrored pairs, where lobes are."""
     rng = np.random.default_rng(7)
     cosines = np.where(rng.random((2, count)) < 0.5, rng.random((2, count)), 10 ** (-4 * rng.random((2, count))))
     phi = 2 * math.pi * rng.random((2, count))
@@ -949,7 +952,9 @@ def _irradiance(b: Bench, own: Mapping[str, float]) -> float:
 
 
 def _lit(b: Bench) -> Iterator[Row]:
-    """A white Lambertian: c (n·l) for a punctual light, by whose colour it is defined, irradiance/π for any other."""
+    """Check a white Lambertian: c (n·l) for a punctual light, whose colour is defined by it, irradiance/π for any
+    other.
+    """
     columns = b.columns(_typical_only)
     sets = [{n: float(c[k]) for n, c in columns.items()} for k in range(next(iter(columns.values())).size)]
     punctual = "C" in b.model.reference

@@ -111,7 +111,7 @@ class _Sheet:
 
 @dataclass(frozen=True)
 class _Family:
-    """Curves for several values of one parameter, the others held."""
+    """Curves for several values of one parameter, with the others fixed."""
 
     parameter: Parameter | None
     values: tuple[float, ...]
@@ -181,7 +181,9 @@ def _evaluate(
     numbers: Mapping[str, Numbers],
     precision: int = 32,
 ) -> np.ndarray:
-    """A model function at its own arguments and the parameters of each slot, all broadcast, as float64; RGB first."""
+    """Evaluate a model function at its own arguments and the parameters of each slot, all broadcast, as float64; RGB
+    first.
+    """
     columns = [*own, *(numbers[slot][p.name] for slot, m in slots.items() for p in m.parameters)]
     arrays = np.broadcast_arrays(*(np.asarray(c, np.float64) for c in columns))
     shape = arrays[0].shape
@@ -212,7 +214,9 @@ def _towards(theta: Any, phi: Any = 0.0) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def _axis(parameter: Parameter, values: Sequence[float], count: int) -> tuple[np.ndarray, bool]:
-    """Values over a parameter's domain, and whether by their logarithm; a user's knows only the values shown."""
+    """Return values over a parameter's domain, and whether they are logarithmic; a user's parameter has only those
+    shown.
+    """
     low, high = (parameter.low, parameter.high) if parameter.typical else (values[0], values[-1])
     least = low if low > 0 else min((v for v in values if v > 0), default=1.0)
     if low >= 0 and high >= 50 * least and (low > 0 or high >= 1e3 * least):
@@ -259,7 +263,7 @@ def _cosine_axis(axes: Axes) -> None:
 
 
 def _map(figure: Figure, axes: Axes, x: np.ndarray, y: np.ndarray, error: np.ndarray) -> None:
-    """A map of errors in the colours that all of them share; grey where there is nothing to compare."""
+    """Draw a map of errors in the colours that all maps share; grey where there is nothing to compare."""
     colours = colours_named("cividis")
     colours = colours.with_extremes(under=colours(0.0))
     axes.set_facecolor("0.85")
@@ -281,7 +285,7 @@ def _largest(error: np.ndarray) -> str:
 
 
 def _ndf(sheet: _Sheet) -> Page:
-    """A row of panels for each parameter (D twice, G1, E), under them what float32 is off by."""
+    """Draw a row of panels for each parameter (D twice, G1, E), and below them the errors of float32."""
     if not sheet.entry.isotropic:
         return _anisotropic(sheet)
     families = sheet.families()[:3]
@@ -349,7 +353,7 @@ def _ndf_row(sheet: _Sheet, family: _Family) -> list[Panel]:
 
 
 def _float64(sheet: _Sheet, cos_m: np.ndarray, sin2_m: np.ndarray, theta: np.ndarray, numbers: Numbers) -> np.ndarray:
-    """D to hold float32's against: the reference, or a user's own text in float64."""
+    """Return D to compare float32's with: the reference, or a user's own text in float64."""
     if "D" in sheet.entry.reference:
         with np.errstate(all="ignore"):
             return np.asarray(sheet.entry.reference["D"](theta, **numbers), np.float64)
@@ -405,7 +409,7 @@ def _error_panel(
     what: str,
     log: bool,
 ) -> None:
-    """A map over x and the family's parameter, or lines where that has a single value."""
+    """Draw a map over x and the family's parameter, or lines where that has a single value."""
     p = family.parameter
     if p is None:
         values = error(np.array(family.values))
@@ -663,7 +667,7 @@ def _fresnel(sheet: _Sheet) -> Page:
 
 
 def _preset(entry: Model, numbers: Mapping[str, float | tuple[float, float, float]]) -> dict[str, np.ndarray]:
-    """Three of each parameter."""
+    """Return three values of each parameter, one per colour: those of a preset, or the default."""
     defaults = {p.name: p.default for p in entry.parameters}
     return {
         p.name: np.broadcast_to(np.asarray(numbers.get(p.name, defaults[p.name]), np.float64), 3)

@@ -19,12 +19,12 @@ def _fujii(c, r):
 
 
 def _again(albedo, mean):
-    """ρ of the multiple scattering."""
+    """Return ρ of the multiple scattering."""
     return np.square(albedo) * mean / (1 - albedo * (1 - mean))
 
 
 def _f(light, view, albedo, roughness):
-    """Single scattering plus (1 - E(l))(1 - E(v))/(1 - Ē), as the paper has it; nothing is lost at roughness 0."""
+    """Evaluate single scattering plus (1 - E(l))(1 - E(v))/(1 - Ē), as in the paper; nothing is lost at roughness 0."""
     cl, cv, r = light[..., 2], view[..., 2], np.asarray(roughness, np.float64)
     s = np.sum(light * view, -1) - cl * cv
     once = albedo / np.pi * (1 + r * np.where(s > 0, s / np.maximum(cl, cv), s)) / (1 + _C1 * r)

@@ -16,7 +16,7 @@ def _f(light, view, albedo, exponent):
 
 
 def _albedo(NoV, albedo, exponent):
-    """∫μ^k dμ = 1/(k + 1) leaves albedo (n·v)^(k-1)."""
+    """Integrate ∫μ^k dμ = 1/(k + 1), which gives the albedo (n·v)^(k-1)."""
     with np.errstate(divide="ignore"):
         return np.asarray(albedo, np.float64) * np.power(np.asarray(NoV, np.float64), exponent - 1.0)
 

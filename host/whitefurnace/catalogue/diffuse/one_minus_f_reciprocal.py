@@ -7,7 +7,7 @@ from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _through(c, f0):
-    """1 - F."""
+    """Return 1 - F."""
     return 1 - (f0 + (1 - np.asarray(f0, np.float64)) * (1 - np.asarray(c, np.float64)) ** 5)
 
 

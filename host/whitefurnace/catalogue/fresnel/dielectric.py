@@ -7,7 +7,7 @@ from whitefurnace.catalogue.model import Checks, Model, Parameter
 
 
 def _f(cos_d, ior):
-    """Amplitudes by the angles, as Fresnel wrote them, with n cos θt = √(n² - sin²θ) by Snell's law."""
+    """Evaluate amplitudes by the angles, as Fresnel wrote them, with n cos θt = √(n² - sin²θ) by Snell's law."""
     c, n = np.broadcast_arrays(np.asarray(cos_d, np.float64), np.asarray(ior, np.float64))
     square = (n - 1) * (n + 1) + c**2
     cos_t = np.sqrt(np.maximum(square, 0.0)) / n

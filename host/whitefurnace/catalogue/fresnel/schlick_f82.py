@@ -6,7 +6,7 @@ from whitefurnace.catalogue.model import Checks, Model, Paper, Parameter
 
 
 def _f(cos_d, f0, f82):
-    """A straight mix of 1, f0 and f82 by weights: (1 - c)⁵ of 1, the dip's share of f82, the rest of f0."""
+    """Mix 1, f0 and f82 linearly: the weight of 1 is (1 - c)⁵, that of f82 the share of the dip, f0 has the rest."""
     c = np.asarray(cos_d, np.float64)
     dip = (c / (1 / 7)) * ((1 - c) / (6 / 7)) ** 6
     grazing = (1 - c) ** 5 - dip * (6 / 7) ** 5

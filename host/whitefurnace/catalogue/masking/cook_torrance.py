@@ -6,7 +6,7 @@ from whitefurnace.catalogue.model import Checks, Model, Paper
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l):
-    """The least of the three terms of G, each divided by (n·l)(n·v) beforehand."""
+    """Return the smallest of the three terms of G, each divided by (n·l)(n·v) first."""
     NoV, NoL = np.asarray(NoV, np.float64), np.asarray(NoL, np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         open_ = 2 * np.asarray(NoH) / VoH

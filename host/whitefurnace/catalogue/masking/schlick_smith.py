@@ -24,7 +24,7 @@ def _g(NoV, NoL, NoH, VoH, at_v, at_l, alpha):
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l, alpha):
-    """A line in each cosine: k at 0, 1 at 1."""
+    """Evaluate a linear function in each cosine: k at 0, 1 at 1."""
     k, NoL = _k(alpha), np.asarray(NoL, np.float64)
     with np.errstate(divide="ignore"):
         return np.where(NoL > 0, 1 / ((NoV * (1 - k) + k) * (NoL * (1 - k) + k)), 0.0)

@@ -21,7 +21,7 @@ def _g(NoV, NoL, NoH, VoH, at_v, at_l):
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l):
-    """The separable V over what correlation adds, G1(v) + G1(l) - G1(v) G1(l)."""
+    """Evaluate the separable V divided by the factor that correlation adds, G1(v) + G1(l) - G1(v) G1(l)."""
     NoL = np.asarray(NoL, np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
         g1_v, g1_l = NoV / np.asarray(at_v, np.float64), NoL / np.asarray(at_l, np.float64)

@@ -145,7 +145,7 @@ def engine_of_data(data: Any, where: str) -> Engine:
 
 
 def _tables(data: dict[str, Any]) -> list[tuple[str, dict[str, Any], Sequence[str]]]:
-    """The tables of a description: a prefix for errors, the fields given, and the names of the known fields."""
+    """Return the tables of a description: a prefix for errors, the fields given, and the names of the known fields."""
     found: list[tuple[str, dict[str, Any], Sequence[str]]] = [("", data, Engine.__struct_fields__)]
     if isinstance(data.get("dfg"), dict):
         found.append(("dfg.", data["dfg"], Dfg.__struct_fields__))
