@@ -61,11 +61,12 @@ def read_icc(data: bytes, path: Path, where: str, channels: int) -> Encoding:
     if space == b"GRAY":
         if channels >= 3:
             raise InputError(f"{path}: {where} holds a grey ICC profile, but the image has {channels} channels")
-        if profile.data[20:24] != b"XYZ ":
-            raise InputError(
-                f"{path}: {where} holds a grey ICC profile over {_text(profile.data[20:24])}, those over XYZ are read"
-            )
-        return _snapped((profile.curve(b"kTRC"),), None, said)
+        curve = profile.curve(b"kTRC")
+        if profile.data[20:24] == b"Lab ":
+            curve = _over_lightness(curve)
+        elif profile.data[20:24] != b"XYZ ":
+            raise profile.wrong(f"its connection space is {_text(profile.data[20:24])}, XYZ or Lab was expected")
+        return _snapped((curve,), None, said)
     if profile.data[20:24] != b"XYZ ":
         raise profile.wrong(f"its connection space is {_text(profile.data[20:24])}, XYZ was expected with a matrix")
     colorants = np.stack([profile.xyz(name) for name in (b"rXYZ", b"gXYZ", b"bXYZ")], axis=1)
@@ -74,6 +75,16 @@ def read_icc(data: bytes, path: Path, where: str, channels: int) -> Encoding:
     except ValueError:
         raise profile.wrong("its colorants span no colour space") from None
     return _snapped(tuple(profile.curve(name) for name in (b"rTRC", b"gTRC", b"bTRC")), matrix, said)
+
+
+def _over_lightness(curve: Curve) -> Curve:
+    """Return the curve of light for one whose values are CIE lightness, L*/100 [ISO/CIE 11664-4, inverted]."""
+
+    def decode(x: np.ndarray) -> np.ndarray:
+        f = (100 * curve.decode(x) + 16) / 116
+        return np.where(f > 6 / 29, f**3, 3 * (6 / 29) ** 2 * (f - 4 / 29))
+
+    return Curve(f"{curve.name} of lightness", decode, curve.bounded)
 
 
 def _snapped(curves: tuple[Curve, ...], matrix: np.ndarray | None, said: str) -> Encoding:
