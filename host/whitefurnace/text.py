@@ -19,6 +19,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> 
     return "\n".join(lines)
 
 
+def printable(text: str) -> str:
+    """Return a text on one line of valid Unicode: line breaks, controls and bytes that are not UTF-8 are escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def size(nbytes: float) -> str:
     """A number of bytes as text with three digits and a decimal unit: 12 B, 3.4 KB, 56.7 MB, 8.9 GB."""
     for unit in ("B", "KB", "MB"):

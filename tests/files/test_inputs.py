@@ -32,6 +32,7 @@ OWN_FILES = {
     "files/png.py": "a temporary file of OpenImageIO",
     "cli/ending.py": "the null device",
     "cli/terminal.py": "the null device",
+    "opencl/cache.py": "files of the cache of kernels",
     "opencl/source.py": "kernels of the package",
     "opencl/device.py": "kernels of the package and the source of pyopencl",
 }
@@ -153,6 +154,43 @@ def test_an_image_of_any_name_is_written_and_read(tmp_path, name):
     path.write_bytes(path.read_bytes()[:-9])
     with pytest.raises(InputError, match="truncated or corrupted"):
         read_image(path)
+
+
+COMMANDS = {
+    "job": ("batch", "X.toml"),
+    "job, dry": ("batch", "X.toml", "--dry-run"),
+    "source": ("bake", "X.exr", "-o", "out"),
+    "source, dry": ("bake", "X.exr", "-o", "out", "--dry-run"),
+    "glTF as a source": ("bake", "X.glb", "-o", "out"),
+    "engine": ("bake", "demo", "-o", "out", "--for", "X.toml"),
+    "model of a bake": ("bake", "demo", "-o", "out", "--ndf", "X.clh"),
+    "model of a table": ("lut", "albedo", "-o", "t.npy", "--ndf", "X.clh"),
+    "environment of a table": ("lut", "radiance", "-o", "t.npy", "--environment", "X.exr"),
+    "model to verify": ("verify", "X.clh"),
+    "scene": ("scene", "X.gltf"),
+    "environment of a scene": ("scene", "scene.gltf", "--environment", "X.exr"),
+    "engine of a scene": ("scene", "scene.gltf", "--for", "X.toml"),
+    "manifest of a picture": ("render", "X.json", "-o", "p.png", "--for", "raw"),
+    "compared": ("compare", "X.exr", "X.exr"),
+    **{f"inspect {suffix}": ("inspect", f"X{suffix}") for suffix in (".json", ".txt", ".h", ".npz", ".npy")},
+    **{f"inspect {suffix}": ("inspect", f"X{suffix}") for suffix in (".ktx", ".dds", ".env", ".gltf", ".png", ".hdr")},
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.whole
+def test_no_command_waits_for_a_pipe_or_reads_a_device(tmp_path, shell, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.gltf").write_text('{"asset": {"version": "2.0"}, "materials": [{}]}')
+    odd = odd_files(tmp_path)
+    for kind in ("pipe", "zero", "folder"):
+        argv = [word.replace("X", kind) if "X" in word else word for word in COMMANDS[command]]
+        for word in argv:
+            if kind in word and kind in odd and not os.path.lexists(word):
+                os.symlink(odd[kind].name, word)
+        assert shell(*argv) in (2, 3), (argv, shell.out)
+        said = [line for line in shell.err.splitlines() if not line.startswith("notice: ")]
+        assert len(said) == 1 and ("not a regular file" in said[0] or kind == "folder"), (argv, said)
 
 
 LINK = """

@@ -469,7 +469,7 @@ def test_files_are_those_of_the_manifest(baked, tmp_path):
     chain.unlink()
     with pytest.raises(FileError, match="lists it and it is not there"):
         shading.render(baked, tmp_path / "new.png", for_="filament")
-    with pytest.raises(FileError, match="there is no such file"):
+    with pytest.raises(FileError, match="No such file"):
         shading.render(tmp_path / "y.json", tmp_path / "new.png", for_="filament")
     (tmp_path / "z.json").write_text("{}")
     with pytest.raises(InputError, match="is not the manifest of a bake"):

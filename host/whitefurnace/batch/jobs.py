@@ -16,7 +16,7 @@ import re
 import tempfile
 import time
 import tomllib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -29,6 +29,7 @@ from whitefurnace.baking import bake as baking
 from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import pool
 from whitefurnace.catalogue.choice import file_of
+from whitefurnace.catalogue.user import user_files
 from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, code_of, nearest
 from whitefurnace.files import (
     FileOutput,
@@ -40,7 +41,7 @@ from whitefurnace.files import (
     locks_in,
     read_input,
     read_text,
-    write_text,
+    write_atomic,
 )
 from whitefurnace.opencl.device import device_address
 from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
@@ -129,6 +130,17 @@ MODELS = ("ndf", "masking", "fresnel", "diffuse", "brdf", "light")
 """Options that name a model, or a file with a user's model."""
 
 
+class Sent(msgspec.Struct, frozen=True):
+    """An input that is sent by value: a file with those beside it that it refers to, or a folder of faces.
+
+    main   name of the file itself, or None for a folder
+    files  bytes of each file by its name relative to the folder of the file, or to the folder
+    """
+
+    main: str | None
+    files: dict[str, bytes]
+
+
 class Item(msgspec.Struct, frozen=True):
     """One environment to bake or one table to make, as plain data that a worker can receive.
 
@@ -140,7 +152,7 @@ class Item(msgspec.Struct, frozen=True):
     recipe   the options as JSON, with the digests of the files that they name
     force    whether outputs are made again, and files of others overwritten
     device   the OpenCL device to use, or None for the default
-    send     whether the source is sent to a cluster by value; `content` then holds its files by name
+    send     whether the files that it reads are sent to a cluster by value; `content` then holds them by their paths
     """
 
     index: int
@@ -154,7 +166,7 @@ class Item(msgspec.Struct, frozen=True):
     force: bool = False
     device: str | None = None
     send: bool = False
-    content: dict[str, bytes] | None = None
+    content: dict[str, Sent] | None = None
 
 
 class Result(msgspec.Struct, frozen=True):
@@ -405,9 +417,7 @@ class _Maker:
                         "--allow-kernels where you trust it"
                     )
                     return {}, False
-                own = self.base / file
-                self.named[own] = None
-                found[option] = f"{own}{spec[len(file) :]}"
+                found[option] = f"{self.base / file}{spec[len(file) :]}"
         return found, True
 
     def bake(self, place: str, table: Bake) -> None:
@@ -419,8 +429,6 @@ class _Maker:
             if "," in name:
                 self.wrong.append(f"{place}.for: {name!r} has a comma; it is a list")
                 return
-            if name.lower().endswith(".toml"):
-                self.named[Path(name)] = None
         if table.for_ is not None and not table.for_:
             self.wrong.append(f"{place}.for is empty")
             return
@@ -434,7 +442,7 @@ class _Maker:
         options |= models
         options["for_"] = ",".join(files or ["raw"])
         try:
-            recipe = _recipe(options)
+            recipe = self._recipe(options)
             order = _bake_plan(recipe, str(output), self.force)
         except WhitefurnaceError as error:
             self.say(place, error)
@@ -512,12 +520,11 @@ class _Maker:
         options |= models
         if table.for_ is not None and table.for_.lower().endswith(".toml"):
             options["for_"] = str(self.base / table.for_)
-            self.named[Path(options["for_"])] = None
         if table.environment is not None:
             options["environment"] = str(self.base / table.environment)
-            self.named[Path(options["environment"])] = None
+        recipe = _encoded(options, {})
         try:
-            recipe = _recipe(options)
+            recipe = self._recipe(options)
             request = _table_plan(recipe, table.kind, str(output), self.force)
             if request.nbytes > MOST_TABLE:
                 raise UsageError(f"a table of {request.nbytes} bytes; a job's have at most {MOST_TABLE}")
@@ -543,8 +550,15 @@ class _Maker:
                 recipe,
                 self.force,
                 self.device,
+                self.send,
             )
         )
+
+    def _recipe(self, options: dict[str, Any]) -> str:
+        """Return the recipe of options, and note the files that it names."""
+        files = named_files(options)
+        self.named |= {file: None for parts in files.values() for file in parts.values()}
+        return _encoded(options, files)
 
     def _take(self, place: str, files: Iterable[str]) -> None:
         """Note the files that an item writes; it is a mistake if another item writes one of them."""
@@ -652,28 +666,88 @@ class _Finder:
 # ---------------------------------------------------------------------------------------------- recipes
 
 
-def _recipe(options: dict[str, Any]) -> str:
+def named_files(options: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
+    """Return the files that the options of an item name: models, engines, and the environment of a table.
+
+    By the path of each, its files and those beside it that it refers to, by their names relative to its folder. Raises
+    what reading them raises.
+    """
+    found: dict[str, dict[str, Path]] = {}
+    for name in MODELS:
+        if (spec := options.get(name)) and (file := file_of(spec)):
+            top = os.path.dirname(file)
+            found[file] = {os.path.relpath(one, top or "."): one for one in user_files(file)}
+    for name in options.get("for_", "").split(","):
+        if name.lower().endswith(".toml"):
+            found[name] = {os.path.basename(name): Path(name)}
+    if environment := options.get("environment"):
+        found[environment] = source_files(environment)
+    return found
+
+
+def _encoded(options: Mapping[str, Any], files: Mapping[str, Mapping[str, Path]]) -> str:
     """Encode options as JSON, with the digests of the files that they name.
 
     A worker caches plans by this text, so a changed file gives a new plan.
     """
-    files = [file for name in MODELS if (spec := options.get(name)) and (file := file_of(spec))]
-    files += [name for name in options.get("for_", "").split(",") if name.lower().endswith(".toml")]
-    if options.get("environment"):
-        files.append(options["environment"])
-    digests = {file: digest_file(file) for file in files}
+    digests = {path: {name: digest_file(file) for name, file in parts.items()} for path, parts in files.items()}
     return json.dumps({"options": options, "files": digests}, sort_keys=True)
 
 
+class _Received:
+    """Files that were sent with an item. All are equal, since the recipe beside them has their digests."""
+
+    def __init__(self, files: Mapping[str, Sent]) -> None:
+        self.files = files
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Received)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+_NOTHING = _Received({})
+
+
 @lru_cache(maxsize=64)
-def _bake_plan(recipe: str, output: str, force: bool) -> baking.BakePlan:
+def _bake_plan(recipe: str, output: str, force: bool, received: _Received = _NOTHING) -> baking.BakePlan:
     """Return the plan of a `[[bake]]`, with a placeholder for the environment."""
-    options = json.loads(recipe)["options"]
-    return baking.plan(BakeRequest(["environment"], output, force=force, **options))
+    with _unpacked(received.files) as places:
+        options = _moved(json.loads(recipe)["options"], places)
+        return baking.plan(BakeRequest(["environment"], output, force=force, **options))
 
 
-def _table_plan(recipe: str, kind: str, output: str, force: bool) -> tables.TablePlan:
-    options = json.loads(recipe)["options"]
+def _plan_of(item: Item) -> baking.BakePlan:
+    """Return the plan of a bake's item, with a placeholder for the environment."""
+    files = {path: sent for path, sent in (item.content or {}).items() if path != item.source}
+    return _bake_plan(item.recipe, item.output, item.force, _Received(files))
+
+
+def _moved(options: dict[str, Any], places: Mapping[str, str]) -> dict[str, Any]:
+    """Return options with the paths of files that were sent replaced by the places where they were unpacked."""
+    moved = dict(options)
+    for name in MODELS:
+        if (spec := options.get(name)) and (file := file_of(spec)) in places:
+            assert file is not None
+            moved[name] = places[file] + spec[len(file) :]
+    if "for_" in options:
+        moved["for_"] = ",".join(places.get(name, name) for name in options["for_"].split(","))
+    if options.get("environment") in places:
+        moved["environment"] = places[options["environment"]]
+    return moved
+
+
+def _table_of(item: Item) -> tables.TablePlan:
+    """Return the plan of a table's item; an environment is read here."""
+    with _unpacked(item.content or {}) as places:
+        return _table_plan(item.recipe, item.source, item.output, item.force, places)
+
+
+def _table_plan(
+    recipe: str, kind: str, output: str, force: bool, places: Mapping[str, str] | None = None
+) -> tables.TablePlan:
+    options = _moved(json.loads(recipe)["options"], places or {})
     axes, fixed = options.pop("axis", []), options.pop("set", [])
     return tables.plan(
         TableRequest(
@@ -752,7 +826,7 @@ def compute(prepared: Prepared) -> Computed | Result:
     try:
         if item.kind == "lut":
             Path(item.output).parent.mkdir(parents=True, exist_ok=True)
-            table = tables.make(_table_plan(item.recipe, item.source, item.output, item.force), item.device)
+            table = tables.make(_table_of(item), item.device)
             return _of_table(item, table, {"compute": time.perf_counter() - begin})
         if loaded is None:
             found = baking.read(_one(item), 0, item.device)
@@ -803,44 +877,62 @@ def do(item: Item) -> Result:
 
 def _one(item: Item, source: str | None = None) -> baking.BakePlan:
     """Return the plan of one item, reading `source` in place of the item's own where it is given."""
-    return replace(
-        _bake_plan(item.recipe, item.output, item.force), names=(item.name,), sources=(source or item.source,)
-    )
+    return replace(_plan_of(item), names=(item.name,), sources=(source or item.source,))
 
 
 MOST_SENT = 1 << 30
-"""Largest size of a source that is sent to a cluster, in bytes."""
+"""Largest size of what is sent to a cluster for one item, in bytes."""
 
 
 def load(item: Item) -> Item:
-    """Return the item with the content of its source, where that is sent by value. Raises FileError and InputError."""
-    if not item.send or item.kind == "lut" or item.source == baking.DEMO:
+    """Return the item with the files that it reads, where these are sent by value. Raises FileError and InputError.
+
+    They are its source with what that refers to, and the models, engines and environments that its recipe names.
+    """
+    if not item.send:
         return item
-    files = source_files(item.source)
-    base = Path(item.source) if os.path.isdir(item.source) else Path(item.source).parent
-    size = sum(input_size(file) for file in files)
+    named = named_files(json.loads(item.recipe)["options"])
+    if item.kind == "bake" and item.source != baking.DEMO:
+        named[item.source] = source_files(item.source)
+    size = sum(input_size(file) for parts in named.values() for file in parts.values())
     if size > MOST_SENT:
-        raise InputError(f"{item.source} has {size} bytes, at most {MOST_SENT} are sent; use a shared folder")
-    content = {os.path.relpath(file, base): read_input(file, most=MOST_SENT) for file in files}
+        raise InputError(f"{item.source} needs {size} bytes, at most {MOST_SENT} are sent; use a shared folder")
+    content = {
+        path: Sent(
+            None if os.path.isdir(path) else os.path.basename(path),
+            {name: read_input(file, most=MOST_SENT) for name, file in parts.items()},
+        )
+        for path, parts in named.items()
+    }
     return msgspec.structs.replace(item, content=content)
+
+
+@contextlib.contextmanager
+def _unpacked(content: Mapping[str, Sent]) -> Iterator[dict[str, str]]:
+    """Write files that were sent into a temporary folder; give the place of each input there by its own path."""
+    if not content:
+        yield {}
+        return
+    with tempfile.TemporaryDirectory(prefix="whitefurnace-") as folder:
+        places = {}
+        for k, (path, sent) in enumerate(content.items()):
+            base = Path(folder, str(k), "beside" if sent.main else os.path.basename(os.path.abspath(path)))
+            for name, data in sent.files.items():
+                if not is_safe(Path(name).as_posix()):
+                    raise InputError(f"{path} refers to {name}, outside its folder, and cannot be sent")
+                file = base / name
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(data)
+            places[path] = str(base / sent.main if sent.main else base)
+        yield places
 
 
 @contextlib.contextmanager
 def _source(item: Item) -> Iterator[str]:
     """Give the path of the item's source: its own, or one in a temporary folder with the content that was sent."""
-    if item.content is None:
-        yield item.source
-        return
-    with tempfile.TemporaryDirectory(prefix="whitefurnace-") as folder:
-        base = Path(folder, item.name)
-        for name, data in item.content.items():
-            if not is_safe(Path(name).as_posix()):
-                raise InputError(f"{item.source} refers to {name}, outside its folder, and cannot be sent")
-            file = base / name
-            file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(data)
-        whole = len(item.content) == 1 or any(name.lower().endswith(".gltf") for name in item.content)
-        yield str(base / Path(item.source).name if whole else base)
+    own = {path: sent for path, sent in (item.content or {}).items() if path == item.source}
+    with _unpacked(own) as places:
+        yield places.get(item.source, item.source)
 
 
 def _check_inside(item: Item) -> None:
@@ -850,7 +942,7 @@ def _check_inside(item: Item) -> None:
         if item.kind == "lut"
         else {
             Path(item.output),
-            *(t.path.parent for t in baking.targets_of(_bake_plan(item.recipe, item.output, item.force), _STEM)),
+            *(t.path.parent for t in baking.targets_of(_plan_of(item), _STEM)),
         }
     )
     for folder in sorted(folders):
@@ -919,9 +1011,7 @@ def predict(item: Item) -> Result:
     try:
         _check_inside(item)
         if item.kind == "lut":
-            return _of_table(
-                item, tables.make(_table_plan(item.recipe, item.source, item.output, item.force), dry_run=True), {}
-            )
+            return _of_table(item, tables.make(_table_of(item), dry_run=True), {})
         order = _one(item)
         found = _of_baked(item, baking.status(order, 0), {})
         if found.state == "skipped":
@@ -1038,12 +1128,12 @@ def clean(job: Job) -> None:
             folder.rmdir()
 
 
-def depfile(job: Job, results: Iterable[Result], path: str | os.PathLike[str]) -> None:
+def depfile(job: Job, results: Sequence[Result], path: str | os.PathLike[str]) -> tuple[str, ...]:
     """Write a dependency file in Makefile syntax: the outputs of every item that is done or up to date, and its inputs.
 
     Inputs are targets without a recipe too, so that a missing input is a reason to run and not an error of make.
-    Raises FileError where the file cannot be written, and InputError for a name with a line break, which the syntax
-    cannot hold.
+    A line with a name that the syntax cannot hold is left out; the notices that are returned say which. Raises
+    FileError where the file cannot be written.
     """
     written = {Path(result.output).parent if result.kind == "lut" else Path(result.output) for result in results}
     # A searched folder changes when a file is added or removed. A folder that is written to changes in every run, so it
@@ -1052,31 +1142,49 @@ def depfile(job: Job, results: Iterable[Result], path: str | os.PathLike[str]) -
     common = [str(job.path), *map(str, job.named), *looked]
     items = {item.index: item for item in job.items}
     lines: list[str] = []
+    notices: dict[str, None] = {}
     needed: dict[str, None] = {}
     for result in results:
         if result.state not in ("done", "skipped"):
             continue
         item = items[result.index]
         made = item.kind == "lut" or item.source == baking.DEMO
-        sources = [] if made else [str(file) for file in source_files(item.source)]
-        needed |= dict.fromkeys([*common, *sources])
-        targets = " ".join(escaped(name, target=True) for name in (result.manifest, *result.files))
-        lines.append(f"{targets}: {' '.join(map(escaped, [*common, *sources]))}\n")
-    lines += [f"{escaped(one, target=True)}:\n" for one in needed]
+        inputs = [*common, *([] if made else _listed(item.source))]
+        needed |= dict.fromkeys(inputs)
+        try:
+            targets = " ".join(escaped(name, target=True) for name in (result.manifest, *result.files))
+            lines.append(f"{targets}: {' '.join(map(escaped, inputs))}\n")
+        except InputError as error:
+            notices[f"{path}: the line of {item.place!r} is left out: {error}"] = None
+    for one in needed:
+        with contextlib.suppress(InputError):
+            lines.append(f"{escaped(one, target=True)}:\n")
     text = "".join(lines)
     # make would read a rule with = before its colon as the definition of a variable.
     if "=" in text:
         text = "whitefurnace_equals := =\n" + text.replace("=", "$(whitefurnace_equals)")
-    write_text(path, text)
+    write_atomic(path, lambda staged: staged.write_bytes(os.fsencode(text)))
+    return tuple(notices)
+
+
+def _listed(source: str) -> list[str]:
+    """Return the paths of the files that an environment was made from; its own where they cannot be found any more."""
+    try:
+        return [str(file) for file in source_files(source).values()]
+    except WhitefurnaceError:
+        return [source]
 
 
 def escaped(name: str, *, target: bool = False) -> str:
     """Escape a file name for Makefiles of GNU make and Ninja; % is escaped in targets alone, where it is a pattern.
 
-    Raises InputError for a name with a line break.
+    Raises InputError for a name with a line break, and for one that ends with a backslash, which would join it to what
+    follows.
     """
     if "\n" in name or "\r" in name:
         raise InputError(f"{name!r} has a line break, which a Makefile cannot hold")
+    if name.endswith("\\"):
+        raise InputError(f"{name!r} ends with a backslash, which a Makefile cannot hold")
     special = r" \t#" + (r":*?\[\]" if os.sep == "/" else "") + ("%" if target else "")
     name = f"./{name}" if name.startswith("~") else name
     # Backslashes before an escaped character are doubled and others are kept, as GCC does.

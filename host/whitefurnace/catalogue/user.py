@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 
 from whitefurnace.catalogue.model import Model, Paper, Parameter
 from whitefurnace.catalogue.user_text import MARK, NUMBERS, VECTORS, Signature, UserText, decoded
 from whitefurnace.errors import FileError, InputError, UsageError, nearest
-from whitefurnace.files import read_input
+from whitefurnace.files import inside, read_input
 
 FORMS = {
     "ndf": ("D", "real", "real cos_m[, real sin2_m][, real p1, …]"),
@@ -106,18 +107,21 @@ def _with_includes(path: Path, folder: Path, files: list[Path], within: tuple[Pa
         quoted = re.fullmatch(r'"([^"]+)"', found[1].strip())
         if quoted is None:
             raise InputError(f'{path}:{line}: #include takes a file beside this one, as #include "NAME.clh"')
-        there = path.parent / quoted[1]
-        if not there.resolve().is_relative_to(folder.resolve()) or Path(quoted[1]).is_absolute():
-            raise InputError(f"{path}:{line}: {quoted[1]!r} is not in the folder of the model's file, {folder}")
+        try:
+            there = inside(folder, os.path.join(os.path.relpath(path.parent, folder), quoted[1]))
+        except ValueError:
+            raise InputError(
+                f"{path}:{line}: {quoted[1]!r} is not in the folder of the model's file, {folder}"
+            ) from None
         if there.resolve() in [one.resolve() for one in (*within, path)]:
             raise InputError(f"{path}:{line}: {quoted[1]!r} includes itself")
         if len(files) > MOST_INCLUDES:
             raise InputError(f"{path}:{line}: more than {MOST_INCLUDES} files are included")
         if not there.exists():
             raise FileError(f"{path}:{line}: {quoted[1]!r} is not found beside this file")
-        inside = _with_includes(there, folder, files, (*within, path))
+        body = _with_includes(there, folder, files, (*within, path))
         pieces.append(
-            f'{text[end : found.start()]}#line 1 "{MARK}{there.name}"\n{inside}\n#line {line} "{MARK}{path.name}"\n'
+            f'{text[end : found.start()]}#line 1 "{MARK}{there.name}"\n{body}\n#line {line} "{MARK}{path.name}"\n'
         )
         end = found.end()
     return "".join(pieces) + text[end:]

@@ -161,7 +161,8 @@ def batch(
                     on_notice=None if quiet else lambda text: say(f"notice: {text}"),
                 )
         if depfile is not None and not dry_run:
-            batching.depfile(made, results, depfile)
+            for notice in batching.depfile(made, results, depfile):
+                say(f"notice: {notice}")
     finally:
         _print_summary(summary, as_json, quiet)
     if summary.failed:

@@ -16,7 +16,9 @@ import click
 
 def print_row(row: Mapping[str, Any]) -> None:
     """Print one JSON row on stdout. Raises ValueError for NaN and infinity: see `plain`."""
-    click.echo(json.dumps(row, ensure_ascii=False, allow_nan=False, default=str))
+    text = json.dumps(row, ensure_ascii=False, allow_nan=False, default=str)
+    # A name that is not UTF-8 has characters that only escapes of JSON can hold.
+    click.echo(text.encode("utf-8", "backslashreplace").decode())
 
 
 def say(text: str) -> None:

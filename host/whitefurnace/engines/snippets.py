@@ -11,6 +11,7 @@ from whitefurnace.errors import UnsupportedError, UsageError, nearest
 from whitefurnace.expression import LANGUAGES, Expression
 from whitefurnace.sphere import harmonics as harmonic
 from whitefurnace.sphere.octahedral_map import atlas_places
+from whitefurnace.text import printable
 
 TYPES = {
     "glsl": {"float": "float", "vec2": "vec2", "vec3": "vec3", "vec4": "vec4"},
@@ -123,7 +124,7 @@ def snippet(engine: Engine, language: str, levels: int, width: int, stem: str = 
         raise UsageError(f"unknown shading language {language!r}{nearest(language, LANGUAGES)}")
     if not engine.holding("specular"):
         raise UnsupportedError(f"{engine.name} is given no prefiltered chain, so there is nothing for a shader to read")
-    to = _Writer(language)
+    to, stem = _Writer(language), printable(stem)
     _header(to, engine, levels, width, stem)
     _resources(to, engine, levels, width, stem)
     _lookup(to, engine, levels, width)

@@ -17,14 +17,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 import numpy.typing as npt
 
-from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import MAX_BYTES, Source, load
+from whitefurnace.files.inputs import inside, plain_name
 from whitefurnace.files.jsontext import Reader, parse_object
 from whitefurnace.files.rgbd import MAX_SIZE, Level, check_chain, decode_face, encode_faces
 
@@ -131,12 +131,9 @@ def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfL
     """
     document, binary = _document(source)
     take = Reader(source)
-    extension = take.object(document.get("extensions", {}), "extensions").get(NAME)
-    if extension is None:
-        raise source.wrong(f"it is a glTF without {NAME}")
-    found = take.array(take.object(extension, NAME).get("lights"), f"{NAME}.lights", 1, MAX_LIGHTS)
     images = _Images(take, document, binary, folder)
-    entries = [_entry(take, entry, f"light {k}") for k, entry in enumerate(found)]
+    entries = _entries(take, document)
+    _neighbours(images, entries)  # all of them are found before the first is read
     texels = sum(6 * (size >> mip) ** 2 for _, size, mips in entries for mip in range(len(mips)))
     if 12 * texels > MAX_BYTES:
         raise source.wrong(f"its lights have {12 * texels} bytes of texels, at most {MAX_BYTES} are allowed")
@@ -150,28 +147,61 @@ def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfL
         ]
         intensity = take.number(light.get("intensity", 1), f"intensity of {what}")
         name = take.text(light.get("name", ""), f"name of {what}")
-        levels = []
-        for mip, faces in enumerate(mips):
-            six = take.array(faces, f"mip {mip} of {what}", 6, 6)
-            levels.append(
-                np.stack(
-                    [
-                        images.face(index, size >> mip, f"face {face} of mip {mip} of {what}")
-                        for face, index in enumerate(six)
-                    ]
-                )
-            )
+        levels = [
+            np.stack([images.face(index, size >> mip, _face(face, mip, what)) for face, index in enumerate(six)])
+            for mip, six in enumerate(mips)
+        ]
         lights.append(GltfLight(tuple(levels), coefficients, (x, y, z, w), intensity, name))
     return tuple(lights)
 
 
-def _entry(take: Reader, entry: Any, what: str) -> tuple[dict[str, Any], int, list[Any]]:
-    """Return the JSON of a light, the side of its level 0 in texels, and its mips."""
+def gltf_light_files(path: str | os.PathLike[str]) -> dict[str, Path]:
+    """Return the files that reading the lights of a .gltf or .glb opens, by their names relative to its folder.
+
+    The first is the glTF itself. Images and buffers that no light uses are not among them. No other file is opened.
+    Raises the errors of `read_gltf_lights`.
+    """
+    path = Path(path)
+    source = load(path)
+    document, binary = _document(source)
+    take = Reader(source)
+    return {path.name: path, **_neighbours(_Images(take, document, binary, path.parent), _entries(take, document))}
+
+
+_Entry = tuple[dict[str, Any], int, list[list[Any]]]
+
+
+def _entries(take: Reader, document: Mapping[str, Any]) -> list[_Entry]:
+    """Return for each light its JSON, the side of its level 0 in texels, and its mips of six indices of images."""
+    extension = take.object(document.get("extensions", {}), "extensions").get(NAME)
+    if extension is None:
+        raise take.source.wrong(f"it is a glTF without {NAME}")
+    found = take.array(take.object(extension, NAME).get("lights"), f"{NAME}.lights", 1, MAX_LIGHTS)
+    return [_entry(take, entry, f"light {k}") for k, entry in enumerate(found)]
+
+
+def _face(face: int, mip: int, what: str) -> str:
+    """Return the name of a face for error messages."""
+    return f"face {face} of mip {mip} of {what}"
+
+
+def _neighbours(images: _Images, entries: Sequence[_Entry]) -> dict[str, Path]:
+    """Return the files that hold the faces of lights, by their names relative to the glTF's folder."""
+    found: dict[str, Path] = {}
+    for k, (_, _, mips) in enumerate(entries):
+        for mip, six in enumerate(mips):
+            for face, index in enumerate(six):
+                found |= images.file(index, _face(face, mip, f"light {k}"))
+    return found
+
+
+def _entry(take: Reader, entry: Any, what: str) -> _Entry:
     light = take.object(entry, what)
     size = take.whole(light.get("specularImageSize"), f"specularImageSize of {what}", 1, MAX_SIZE)
     if size & (size - 1):
         raise take.source.wrong(f"specularImageSize of {what} is {size}, a power of two was expected")
-    return light, size, take.array(light.get("specularImages"), f"specularImages of {what}", 1, size.bit_length())
+    mips = take.array(light.get("specularImages"), f"specularImages of {what}", 1, size.bit_length())
+    return light, size, [take.array(faces, f"mip {mip} of {what}", 6, 6) for mip, faces in enumerate(mips)]
 
 
 def _document(source: Source) -> tuple[dict[str, Any], memoryview | None]:
@@ -214,7 +244,10 @@ def _json(source: Source, data: memoryview) -> dict[str, Any]:
 
 
 class _Images:
-    """Images of a glTF by index. Each image is decoded once, and each buffer or file is loaded once."""
+    """Images of a glTF by index. Each image is decoded once, and each buffer or file is loaded once.
+
+    Nothing is opened but what is asked for. folder: where its other files are; None where it must have none.
+    """
 
     def __init__(
         self, take: Reader, document: Mapping[str, Any], binary: memoryview | None, folder: Path | None
@@ -234,6 +267,15 @@ class _Images:
             self._faces[k, side] = decode_face(piece, side)
         return self._faces[k, side]
 
+    def file(self, index: Any, what: str) -> dict[str, Path]:
+        """Return the file that holds image `index`, by its name relative to the glTF's folder; empty for the glTF."""
+        k = self._index(index, len(self._images), "image", what)
+        image = self._take.object(self._images[k], f"image {k}")
+        if "uri" in image:
+            return self._place(image["uri"], f"image {k}")
+        buffer = self._take.object(self._buffers[self._view(image, k)[1]], "a buffer")
+        return self._place(buffer["uri"], f"buffer {self._view(image, k)[1]}") if "uri" in buffer else {}
+
     def _index(self, value: Any, count: int, thing: str, what: str) -> int:
         if not count:
             raise self._source.wrong(f"{what} names an {thing}, there is none")
@@ -243,16 +285,20 @@ class _Images:
         image = self._take.object(self._images[k], f"image {k}")
         if "uri" in image:
             return self._uri(image["uri"], f"image {k}")
-        view_number = self._index(image.get("bufferView"), len(self._views), "bufferView", f"image {k}")
-        what = f"bufferView {view_number}"
-        view = self._take.object(self._views[view_number], what)
-        buffer = self._index(view.get("buffer"), len(self._buffers), "buffer", what)
+        number, buffer = self._view(image, k)
+        what, view = f"bufferView {number}", self._views[number]
         data = self._buffer(buffer)
         at = self._take.whole(view.get("byteOffset", 0), f"byteOffset of {what}", 0, len(data))
         length = self._take.whole(view.get("byteLength"), f"byteLength of {what}", 1, len(data))
         if at + length > len(data):
             raise self._source.wrong(f"{what} takes bytes {at} to {at + length}, buffer {buffer} has {len(data)}")
         return data[at : at + length]
+
+    def _view(self, image: Mapping[str, Any], k: int) -> tuple[int, int]:
+        """Return the numbers of the bufferView of image k and of its buffer."""
+        number = self._index(image.get("bufferView"), len(self._views), "bufferView", f"image {k}")
+        view = self._take.object(self._views[number], f"bufferView {number}")
+        return number, self._index(view.get("buffer"), len(self._buffers), "buffer", f"bufferView {number}")
 
     def _buffer(self, k: int) -> memoryview:
         if k not in self._loaded:
@@ -277,23 +323,21 @@ class _Images:
                 return memoryview(base64.b64decode(body, validate=True))
             except (binascii.Error, ValueError):
                 raise self._source.wrong(f"the data URI of {what} is not valid base64") from None
-        return load(self._file(unquote(uri), what)).view
+        (path,) = self._place(uri, what).values()
+        return load(path).view
 
-    def _file(self, name: str, what: str) -> Path:
-        """Return the path of a file in the folder of the glTF.
-
-        Schemes, absolute paths, paths upwards and links out of the folder are refused: an untrusted glTF must not
-        reveal other files of the disk.
-        """
-        shown = name[:60].encode("ascii", "backslashreplace").decode()
-        outside = self._source.wrong(f"the uri of {what}, {shown!r}, is not a file in the folder of the glTF")
-        if self._folder is None or not name or not name.isprintable() or name[0] in "/\\" or set(name) & set(":\\"):
-            raise outside
+    def _place(self, value: Any, what: str) -> dict[str, Path]:
+        """Return the file of a URI by its name relative to the folder of the glTF; empty for a data URI."""
+        uri = self._take.text(value, f"the uri of {what}")
+        if uri[: len(_DATA)].lower() == _DATA:
+            return {}
+        name = os.fsdecode(unquote_to_bytes(uri.encode("utf-8", "surrogatepass")))
         try:
-            folder = self._folder.resolve(strict=True)
-            path = (folder / name).resolve()
-        except (OSError, ValueError, RuntimeError) as error:
-            raise FileError(f"cannot read {shown!r}, which {what} of {self._source.name} names: {error}") from error
-        if not path.is_relative_to(folder):
-            raise outside
-        return path
+            if self._folder is None:
+                raise ValueError
+            path = inside(self._folder, name)
+        except ValueError:
+            raise self._source.wrong(
+                f"the uri of {what}, {plain_name(name)!r}, is not a file in the folder of the glTF"
+            ) from None
+        return {os.path.normpath(name): path}

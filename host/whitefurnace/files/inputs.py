@@ -91,6 +91,29 @@ def head_of(path: str | os.PathLike[str], count: int) -> bytes:
         return b""
 
 
+def inside(folder: str | os.PathLike[str], name: str) -> Path:
+    """Return the path of a file that another file in `folder` names, without opening it.
+
+    A file from a stranger must not reveal other files of the disk. Raises ValueError for a name that leads out of the
+    folder: an absolute path, a drive, a URL, a way upwards, or a link to somewhere else.
+    """
+    if not name or name[0] in "/\\" or set(name) & {":", "\\", "\0"}:
+        raise ValueError(f"{name!r} is not the name of a file in a folder")
+    try:
+        top = os.path.realpath(folder)
+        real = os.path.realpath(os.path.join(top, name))
+    except OSError as error:  # links in a circle
+        raise ValueError(f"{name!r} cannot be found: {error}") from error
+    if os.path.commonpath([top, real]) != top:
+        raise ValueError(f"{name!r} is not in the folder")
+    return Path(folder, name)
+
+
+def plain_name(name: str, most: int = 60) -> str:
+    """Return the beginning of a name that a file gives, in printable ASCII, for error messages."""
+    return name[:most].encode("unicode_escape").decode()
+
+
 @contextlib.contextmanager
 def library_name(path: str | os.PathLike[str]) -> Iterator[str]:
     """Give a name of a file that OpenImageIO accepts.

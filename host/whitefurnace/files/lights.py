@@ -13,12 +13,11 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 
-from whitefurnace.errors import FileError, InputError, UnsupportedError
+from whitefurnace.errors import InputError, UnsupportedError
 from whitefurnace.files import ktx1, ktx2
 from whitefurnace.files.atomic import digest_file
 from whitefurnace.files.binary import Source, load
@@ -26,8 +25,8 @@ from whitefurnace.files.codec import decode, require_decoder
 from whitefurnace.files.containers import is_texture, parse_texture
 from whitefurnace.files.env import MAGIC as ENV_MAGIC
 from whitefurnace.files.env import parse_env
-from whitefurnace.files.gltf_lights import GLB_MAGIC, read_gltf_lights
-from whitefurnace.files.inputs import head_of, read_input
+from whitefurnace.files.gltf_lights import GLB_MAGIC, gltf_light_files, read_gltf_lights
+from whitefurnace.files.inputs import head_of
 from whitefurnace.files.packing import FORMATS
 from whitefurnace.files.texture import Texture, upright
 
@@ -253,23 +252,22 @@ def _gltf(path: Path) -> Light:
     )
 
 
-def light_files(path: str | os.PathLike[str]) -> list[Path]:
-    """List the file, and for a .gltf the image and buffer files that it refers to."""
+def light_files(path: str | os.PathLike[str]) -> dict[str, Path]:
+    """Return the files that reading a light or an image opens, by their names relative to its folder.
+
+    The first is the file itself; a glTF, by its content, may have images and buffers in others. No other file is
+    opened. Raises `FileError` and `InputError` for a glTF that is not valid or names a file outside its folder.
+    """
     path = Path(path)
-    try:
-        document = json.loads(read_input(path, "a glTF", most=1 << 30)) if path.suffix.lower() == ".gltf" else {}
-        uris = [entry.get("uri", "data:") for part in ("images", "buffers") for entry in document.get(part, ())]
-    except (FileError, InputError, ValueError, AttributeError, TypeError, RecursionError):
-        return [path]
-    return [path, *(path.parent / unquote(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:"))]
+    return gltf_light_files(path) if _kind(path) == "gltf" else {path.name: path}
 
 
 def light_digest(path: str | os.PathLike[str]) -> str:
-    """Return the sha256 of the file's bytes in hex; for a .gltf with further files, that of all their digests joined.
+    """Return the sha256 of the file's bytes in hex; for a glTF with further files, that of all their digests joined.
 
-    Raises `FileError`.
+    Raises the errors of `light_files`.
     """
-    parts = [digest_file(file) for file in light_files(path)]
+    parts = [digest_file(file) for file in light_files(path).values()]
     return parts[0] if len(parts) == 1 else hashlib.sha256("".join(parts).encode()).hexdigest()
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction
+from whitefurnace.files.inputs import head_of
 
 if sys.platform == "win32":
     import msvcrt
@@ -176,11 +177,7 @@ def _left(path: Path, handle: int) -> tuple[str, ...]:
 
 def is_lock(path: Path) -> bool:
     """Return whether a file is a lock of this tool, judged by its first bytes; False where it cannot be read."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(len(_BEGIN)) == _BEGIN
-    except OSError:
-        return False
+    return head_of(path, len(_BEGIN)) == _BEGIN
 
 
 def locks_in(folder: Path) -> list[Path]:

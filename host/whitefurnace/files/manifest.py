@@ -45,5 +45,9 @@ def write_manifest(
         raise ValueError("a manifest must have the key 'whitefurnace', the version that wrote it")
     # Python's own indentation is written in Python, at a tenth of the speed.
     plain = json.dumps(manifest, sort_keys=True, ensure_ascii=False, allow_nan=False)
-    text = msgspec.json.format(plain, indent=2) + "\n"
-    write_atomic(path, lambda temporary: temporary.write_bytes(text.encode()), into)
+    try:
+        text = msgspec.json.format(plain, indent=2)
+    except (UnicodeEncodeError, msgspec.DecodeError):  # a name that is not UTF-8; escapes of JSON can hold it
+        text = json.dumps(manifest, sort_keys=True, allow_nan=False, indent=2)
+    data = text.encode() + b"\n"
+    write_atomic(path, lambda temporary: temporary.write_bytes(data), into)

@@ -19,6 +19,7 @@ from whitefurnace.files.containers import write_texture
 from whitefurnace.files.packing import FORMATS
 from whitefurnace.files.png import MAX_SIDE, encode_png
 from whitefurnace.files.texture import MAX_LAYERS, text_value
+from whitefurnace.text import printable
 
 STORED: Mapping[str, Sequence[str]] = {
     ".png": ("r16", "r8"),
@@ -168,7 +169,7 @@ def number(value: float, kind: str) -> str:
 def _header(stem: str, cells: npt.NDArray[Any], comment: Sequence[str]) -> Iterator[str]:
     """Yield the text of a C header with the array `cells`."""
     name, kind = identifier(stem), cells.dtype.name
-    yield "".join(f"// {line}\n" for line in comment)
+    yield "".join(f"// {printable(line)}\n" for line in comment)
     yield f"#ifndef {name.upper()}_H\n#define {name.upper()}_H\n\n"
     shape = cells.shape[:-1] if cells.shape[-1] == 1 else cells.shape
     yield f"static const {'float' if kind == 'float32' else 'double'} {name}{''.join(f'[{n}]' for n in shape)} = {{\n"

@@ -91,8 +91,8 @@ def upright(texels: npt.NDArray[np.float32], orientation: str) -> npt.NDArray[np
 
 
 def text_value(text: str) -> bytes:
-    """Encode a text as the value of a key: UTF-8 that ends with a NUL."""
-    return text.encode() + b"\0"
+    """Encode a text as the value of a key: UTF-8 that ends with a NUL; what is not Unicode in a name is escaped."""
+    return text.encode("utf-8", "backslashreplace") + b"\0"
 
 
 def level_bytes(form: str, width: int, height: int, k: int) -> int:

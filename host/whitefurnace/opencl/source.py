@@ -18,6 +18,7 @@ from whitefurnace.catalogue import Integral, Model
 from whitefurnace.catalogue.user_text import MARK
 from whitefurnace.opencl import constants
 from whitefurnace.opencl.bindings import FUNCTIONS, VECTOR, bindings, is_isotropic, lanes
+from whitefurnace.text import printable
 
 LOBE_WIDTH = 0.05
 """Width in radians for which the rule of a user's BRDF grades its half vectors. Lobes ten times narrower are still
@@ -228,7 +229,7 @@ def assembled(
     lines: list[str] = []
 
     def add(name: str, text: str) -> None:
-        quoted = " ".join(name.replace("\\", "/").replace('"', "'").split())
+        quoted = printable(" ".join(name.split())).replace("\\", "/").replace('"', "'")
         lines.append(f'#line 1 "{quoted}"\n{text.rstrip()}\n')
 
     for piece in row.pieces:

@@ -16,6 +16,7 @@ from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageEr
 from whitefurnace.files import (
     decode,
     digest_file,
+    input_size,
     read_env,
     read_gltf_lights,
     read_manifest,
@@ -453,8 +454,7 @@ def engine_in(manifest: str | os.PathLike[str], name: str) -> tuple[Engine, Path
     UsageError for an engine that it was not baked for.
     """
     path = Path(manifest)
-    if not path.is_file():
-        raise FileError(f"cannot read {path}: there is no such file")
+    input_size(path, "a manifest")
     found = read_manifest(path)
     listed = _listed(dictionary(found))
     if found is None or not listed or not isinstance(found.get("name"), str):
@@ -471,7 +471,7 @@ def engine_in(manifest: str | os.PathLike[str], name: str) -> tuple[Engine, Path
         if entry.split("/")[0] != engine.name:
             continue
         file = path.parent / entry
-        if not file.is_file():
+        if not file.exists():
             raise FileError(f"cannot read {file}: {path} lists it and it is not there")
         if digest_file(file) != dictionary(stated).get("sha256"):
             raise InputError(f"{file} is not the file that {path} lists: it was changed since the bake")

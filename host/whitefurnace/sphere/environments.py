@@ -23,6 +23,7 @@ from whitefurnace.files import (
     decode_srgb,
     digest_file,
     image_facts,
+    inside,
     is_light,
     light_digest,
     light_files,
@@ -204,10 +205,14 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
 
 
-def source_files(source: str | os.PathLike[str]) -> list[Path]:
-    """Return the files that `environment` reads for a path. Raises as it does for a folder without faces."""
+def source_files(source: str | os.PathLike[str]) -> dict[str, Path]:
+    """Return the files that `environment` opens for a path, by their names relative to its folder.
+
+    They are a file and what a glTF keeps beside it, or the six faces in a folder. Nothing else is read, hashed, sent or
+    listed for an environment. Raises as `environment` does for what is not one.
+    """
     path = Path(source)
-    return _face_paths(path) if os.path.isdir(path) else light_files(path)
+    return {face.name: face for face in _face_paths(path)} if os.path.isdir(path) else light_files(path)
 
 
 def source_digest(source: str | os.PathLike[str]) -> str:
@@ -253,7 +258,7 @@ def _stamps(path: Path) -> tuple[tuple[int, ...], ...] | None:
     try:
         return tuple(
             (s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
-            for s in (os.stat(file) for file in source_files(path))
+            for s in (os.stat(file) for file in source_files(path).values())
         )
     except (OSError, ValueError, FileError, InputError):
         return None
@@ -367,7 +372,13 @@ def _face_paths(folder: Path) -> list[Path]:
         if len(by_stem[name]) > 1:
             both = " and ".join(path.name for path in by_stem[name])
             raise InputError(f"{folder} holds the cube face {name} more than once ({both}), one file was expected")
-    return [by_stem[name][0] for name in names]
+    found = [by_stem[name][0] for name in names]
+    for path in found:
+        try:
+            inside(folder, path.name)
+        except ValueError:
+            raise InputError(f"{path} is a link to a file outside {folder}; copy the file there") from None
+    return found
 
 
 def _layout_of(shape: tuple[int, ...], where: str) -> Layout:
