@@ -18,6 +18,8 @@ class Integrated:
     seconds      wall time
     rule         name of the finest quadrature rule that was used
     notices      sentences about work that was not requested, such as cells computed in float64
+    errors       estimated absolute errors of the cells: array of the shape of `values` without the axis of a vector
+                 integral's components, of which each cell has the largest; None where they were not asked for
     """
 
     values: np.ndarray
@@ -26,6 +28,7 @@ class Integrated:
     seconds: float
     rule: str
     notices: tuple[str, ...] = field(default=())
+    errors: np.ndarray | None = None
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         return np.array(self.values, dtype=dtype) if dtype or copy else self.values

@@ -671,28 +671,10 @@ def test_cells_that_float32_cannot_do_are_promoted_with_a_notice(device: Device,
     assert np.abs(got.values - want.values).max() <= got.error + want.error
 
 
-def test_what_is_not_finite_is_refused(device: Device) -> None:
+def test_what_is_not_finite_is_refused(device: Device, files: Any) -> None:
+    broken = files("broken", "real3 brdf_broken_f(real3 l, real3 v) { return vec3(sqrt(-1 - l.z), 0, 0); }")
     with pytest.raises(CheckError, match="not finite"):
-        integrate(
-            "albedo", ndf="ggx:alpha=.5", masking=_broken(), NoV=0.5, precision=64 if device.fp64 else 32, device=device
-        )
-
-
-def _broken() -> Model:
-    """Kelemen's entry over a kernel that gives NaN."""
-    from dataclasses import replace
-
-    return replace(
-        MASKINGS["kelemen"],
-        text="""
-static inline real masking_kelemen_at(DIRECTION d MASKING_PARAMETERS) { return (real)0; }
-static inline real masking_kelemen_V(real NoV, real NoL, real NoH, real VoH, real at_v, real at_l
-                                     MASKING_PARAMETERS) { return sqrt(-1 - NoH); }
-static inline real masking_kelemen_G(real NoV, real NoL, real NoH, real VoH, real at_v, real at_l
-                                     MASKING_PARAMETERS) { return NoV; }
-""",
-        path="broken.clh",
-    )
+        integrate("albedo", brdf=broken, NoV=0.5, precision=64 if device.fp64 else 32, device=device)
 
 
 def test_precision(device: Device) -> None:

@@ -149,6 +149,14 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light (for 
     "kinds have their own]"
 )
 @options.option(
+    "--relative-tolerance",
+    metavar="X",
+    type=float,
+    heading=ACCURACY,
+    help="Largest error as a share of each value, above 0 and below 1, in place of the absolute tolerance; with both, "
+    "the larger of them holds for each value. Of integrals themselves, dfg and radiance.",
+)
+@options.option(
     "--precision",
     metavar="32|64",
     type=int,
@@ -192,6 +200,7 @@ def lut(
     exposure: float,
     nonfinite: str,
     tolerance: float | None,
+    relative_tolerance: float | None,
     precision: int,
     fit: str | None,
     as_read: bool,
@@ -228,6 +237,7 @@ def lut(
             exposure=exposure,
             nonfinite=nonfinite,
             tolerance=tolerance,
+            relative_tolerance=relative_tolerance,
             precision=precision,
             fit=fit,
             as_read=as_read,

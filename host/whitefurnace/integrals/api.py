@@ -37,13 +37,17 @@ def integrate(
     nonfinite: str = "refuse",
     precision: int = 32,
     tolerance: float | None = None,
+    relative_tolerance: float | None = None,
     backfacing: str | None = None,
     device: Device | str | None = None,
     out: np.ndarray | None = None,
+    out_errors: np.ndarray | None = None,
     progress: Progress | None = None,
     **parameters: Any,
 ) -> Integrated:
-    """Integrate a BRDF over all broadcast `parameters` and return the values with their error.
+    """Integrate a BRDF over all broadcast `parameters` and return the values with their errors.
+
+    `error` of the result is the largest estimated absolute error, and `errors` holds that of each cell.
 
     name: the integral: normalization, projected_area, weak_furnace, albedo, albedo_average, dfg or radiance.
     ndf, masking, fresnel, diffuse: models of the BRDF, as names (`ggx`, `ggx:alpha=.3`, `schlick:gold`), catalogue
@@ -68,10 +72,15 @@ def integrate(
       that of a light of radiance 1; for an environment it is relative to the mean radiance, default 1e-5 and 1e-7. Two
       quadrature rules are compared and the values of the finer one are kept where they agree within it, or at the end
       of the rules, with the error stated. Cells that float32 cannot do are done in float64, with a notice.
+    relative_tolerance: the error asked for as a share of each value, in (0, 1). Given alone, it replaces the absolute
+      tolerance, which may be small beside a value or large beside another; given with it, the larger of both holds for
+      each cell. Like `epsrel` and `epsabs` of `scipy.integrate.quad`.
     backfacing: what to do with views behind the surface, NoV < 0: "clamp" to 0 or "absolute". They are refused by
       default. Light from behind gives 0.
     device: a device or a name of one, as `choose_device` takes it.
-    out: an array for the values, such as a memory map. A grid of any size then needs little memory of its own.
+    out: an array for the values, such as a memory map. A grid of any size then needs little memory of its own, and
+      states no errors of its cells but in `out_errors`.
+    out_errors: an array for the errors of the cells, of the shape of the values without the axis of components.
     progress: called with the share done, in [0, 1], after each part of the grid.
 
     Raises UsageError for unknown names and values outside their domain, UnsupportedError for a combination that no rule
@@ -79,7 +88,8 @@ def integrate(
     """
     models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf}
     accuracy: dict[str, Any] = {"precision": precision, "tolerance": tolerance, "backfacing": backfacing}
-    course: dict[str, Any] = {"device": device, "out": out, "progress": progress}
+    accuracy["relative_tolerance"] = relative_tolerance
+    course: dict[str, Any] = {"device": device, "out": out, "out_errors": out_errors, "progress": progress}
     lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
     if name != "radiance":
         wrong = [key for key, value in lit.items() if value is not None]

@@ -46,6 +46,12 @@ UNFINISHED = 3
 """Factor on the last change that bounds the error where the rules did not converge. An error of first order in the
 nodes, as kinks have it, falls by 1.4 per rule, and 1/1.4 + 1/1.4² + … is 2.5."""
 
+OF_OTHERS = {
+    **dict.fromkeys(("rtol", "epsrel", "rel_tol", "reltol", "relative"), "relative_tolerance"),
+    **dict.fromkeys(("atol", "epsabs", "abs_tol", "abstol", "tol"), "tolerance"),
+}
+"""Names that scipy, numpy and Python's math have for our keywords."""
+
 Progress = Callable[[float], None]
 
 
@@ -59,9 +65,11 @@ def integrate(
     brdf: Spec | None = None,
     precision: int = 32,
     tolerance: float | None = None,
+    relative_tolerance: float | None = None,
     backfacing: str | None = None,
     device: Device | str | None = None,
     out: np.ndarray | None = None,
+    out_errors: np.ndarray | None = None,
     progress: Progress | None = None,
     **parameters: Any,
 ) -> Integrated:
@@ -74,10 +82,7 @@ def integrate(
         raise UsageError(f"precision {precision} is not one of 32, 64")
     entry = integral(name)
     _refuse_lit(entry)
-    if tolerance is None:
-        tolerance = DEFAULT_TOLERANCE[precision]
-    if not is_number(tolerance) or not 0 < tolerance < 1:
-        raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
+    tolerance, relative = tolerances(tolerance, relative_tolerance, DEFAULT_TOLERANCE[precision])
     slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
     grid = grid_of(entry, slots, dict(parameters), backfacing)
     on = device if isinstance(device, Device) else choose_device(device)
@@ -87,28 +92,73 @@ def integrate(
     components = parts[0].components
     shape = grid.shape if components == 1 else (*grid.shape, components)
     values = room_for(shape, precision, out)
+    errors = room_for_errors(grid.shape, out, out_errors)
     flat = values.reshape(grid.size, components)
-    totals = Totals()
+    totals, error, over = Totals(), 0.0, (0.0, 0.0, 0.0)
     for begin in range(0, grid.size, CELLS_A_LAUNCH):
         end = min(begin + CELLS_A_LAUNCH, grid.size)
-        total = sum(
-            _average(part, grid, begin, end, tolerance, totals)
+        found = [
+            _average(part, grid, begin, end, tolerance, totals, relative)
             if entry.name == "albedo_average"
-            else _at_grazing(part, grid.rows(part, begin, end), tolerance, totals)
+            else _at_grazing(part, grid.rows(part, begin, end), tolerance, totals, relative)
             for part in parts
-        )
+        ]
+        total, off = sum(values for values, _ in found), np.asarray(sum(errors for _, errors in found))
         flat[begin:end] = np.asarray(total).T
+        if errors is not None:
+            errors.reshape(-1)[begin:end] = off
+        error = max(error, float(off.max()))
+        over = max(over, _furthest(off, np.abs(np.asarray(total)).max(0), tolerance, relative, precision))
         if progress:
             progress(end / grid.size)
-    error = totals.error * len(parts)
     return Integrated(
         values,
         error,
         totals.evaluations,
         time.perf_counter() - start,
         totals.rule.name if totals.rule else "",
-        (*totals.notices(), *missed(error, tolerance, precision), *_of_files(parts, flat)),
+        (
+            *totals.notices(),
+            *(missed_relative(over, relative) if relative else missed(error, tolerance, precision)),
+            *_of_files(parts, flat),
+        ),
+        errors,
     )
+
+
+def tolerances(absolute: float | None, relative: float | None, default: float) -> tuple[float, float]:
+    """Return the absolute and the relative tolerance, of which a cell needs the larger. 0 stands for none.
+
+    default: the absolute tolerance where neither is given. Raises UsageError.
+    """
+    if relative is not None and (not is_number(relative) or not 0 < relative < 1):
+        raise UsageError(f"relative_tolerance {relative!r} is outside (0, 1)")
+    if absolute is None:
+        absolute = default if relative is None else 0.0
+    if not is_number(absolute) or not (0 < absolute < 1 or (absolute == 0 and relative is not None)):
+        raise UsageError(f"tolerance {absolute!r} is outside (0, 1)")
+    return float(absolute), float(relative or 0.0)
+
+
+def _furthest(
+    errors: np.ndarray, size: np.ndarray, tolerance: float, relative: float, precision: int
+) -> tuple[float, float, float]:
+    """Return the largest ratio of an error to what the cell allows, with that error and the size of its value."""
+    allowed = np.maximum(np.maximum(tolerance, relative * size), ROUNDING[precision] * size)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        ratio = np.where(np.isfinite(size) & (errors > 0), errors / allowed, 0.0)
+    worst = int(np.argmax(ratio))
+    return float(ratio[worst]), float(errors[worst]), float(size[worst])
+
+
+def missed_relative(over: tuple[float, float, float], relative: float) -> Iterator[str]:
+    """Yield a notice where an error misses the tolerance by more than twice; `over` is what `_furthest` returns."""
+    ratio, error, size = over
+    if not ratio <= 2:
+        yield (
+            f"the error of {error:.2g} of a value of {size:.2g} is over the relative tolerance of {relative:g}: the "
+            "finest rule did not reach it"
+        )
 
 
 def missed(error: float, tolerance: float, precision: int) -> Iterator[str]:
@@ -189,6 +239,20 @@ def room_for(shape: tuple[int, ...], precision: int, out: np.ndarray | None) -> 
     if out.shape != shape or not out.flags.c_contiguous or out.dtype.kind != "f":
         raise UsageError(f"out is {out.dtype} of shape {out.shape}; needed is a contiguous array of floats, {shape}")
     return out
+
+
+def room_for_errors(shape: tuple[int, ...], out: np.ndarray | None, errors: np.ndarray | None) -> np.ndarray | None:
+    """Return the array for the errors of the cells: the one given, or a new one unless `out` saves memory.
+
+    Raises UsageError for an array of another shape or dtype.
+    """
+    if errors is None:
+        return np.empty(shape) if out is None else None
+    if errors.shape != shape or not errors.flags.c_contiguous or errors.dtype.kind != "f":
+        raise UsageError(
+            f"out_errors is {errors.dtype} of shape {errors.shape}; needed is a contiguous array of floats, {shape}"
+        )
+    return errors
 
 
 # ---------------------------------------------------------------------------------------------- what is asked
@@ -331,6 +395,8 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
 def _suggested(name: str, known: Sequence[str]) -> str:
     """Return the end of the error message for an unknown parameter: a misspelt keyword of `integrate` is one too."""
     keywords = [key for key in inspect.signature(integrate).parameters if key not in ("name", "parameters")]
+    if name in OF_OTHERS:
+        return f"; it is called {OF_OTHERS[name]} here"
     # At .8 and above one or two letters differ.
     close = difflib.get_close_matches(name.casefold(), keywords, n=1, cutoff=0.8)
     return nearest(name, close or known)
@@ -441,6 +507,11 @@ class Part:
         return np.concatenate(out), terms, error
 
     @property
+    def slow(self) -> float:
+        """Largest ratio of a rule's error to its change from the rule before."""
+        return max(m.checks.slow_rules or 1.0 for m in self.slots.values())
+
+    @property
     def ladder(self) -> tuple[Rule, ...]:
         """The rules of this part, from the coarsest to the finest."""
         return LADDERS[self.kind]
@@ -518,57 +589,90 @@ class Totals:
         )
 
 
-@np.errstate(invalid="ignore", over="ignore")  # values that are infinite in float32 are computed in float64
-def climb(part: Part, rows: np.ndarray, tolerance: float, totals: Totals, precision: int | None = None) -> np.ndarray:
-    """Integrate cells by finer and finer rules until two neighbouring rules agree: (components, n).
+def climb(
+    part: Part,
+    rows: np.ndarray,
+    tolerance: float,
+    totals: Totals,
+    precision: int | None = None,
+    relative: float = 0.0,
+) -> np.ndarray:
+    """Return the values of `climb_with_errors` alone, (components, n)."""
+    return climb_with_errors(part, rows, tolerance, totals, precision, relative)[0]
 
-    rows: view and parameters, (k, n). tolerance: largest absolute difference of the two rules; each block of cells
-    continues until all of its cells agree. totals: gets the error and the work. precision: 32 or 64 bits, None for that
-    of the part. Raises CheckError for values that are not finite.
+
+@np.errstate(invalid="ignore", over="ignore", divide="ignore")  # values infinite in float32 are computed in float64
+def climb_with_errors(
+    part: Part,
+    rows: np.ndarray,
+    tolerance: float,
+    totals: Totals,
+    precision: int | None = None,
+    relative: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrate cells by finer and finer rules until two neighbouring rules agree: (components, n) and errors (n,).
+
+    rows: view and parameters, (k, n). tolerance, relative: a cell's two rules may differ by the larger of the absolute
+    tolerance and the relative one times its value; each block of cells continues until all of its cells agree, and
+    each of them states the largest of the block's differences, measured in what each allows. totals: gets the error
+    and the work. precision: 32 or 64 bits, None for that of the part. Raises CheckError for values that are not finite.
     """
     precision = precision or part.precision
     ladder = part.ladder
-    cells, terms, floor = part.cells(rows, precision, tolerance)
+    coarse = max(tolerance, relative)
+    cells, terms, floor = part.cells(rows, precision, coarse)
     n = rows.shape[1]
     # A coarse tolerance starts low, a tight one where the tables of the rules say it can end.
-    first = 0 if tolerance >= 1e-3 else 1 if tolerance >= 1e-5 else 3 if tolerance >= 1e-8 else 5
+    first = 0 if coarse >= 1e-3 else 1 if coarse >= 1e-5 else 3 if coarse >= 1e-8 else 5
     values = part.sum(cells, terms, ladder[first], precision).astype(np.float64)
+    errors = np.zeros(n)
     totals.used(ladder[first], part.lanes(cells))
     active = np.arange(n)
-    change = np.empty(0)
-    slow = max(m.checks.slow_rules or 1.0 for m in part.slots.values())
+    left = np.empty(0)
+    slow = part.slow
     before = np.where(np.minimum(BLOCK, n - np.arange(0, n, BLOCK)) < BLOCK, np.inf, 0.0)
     for rule in ladder[first + 1 :]:
         fine = part.sum(cells[:, active], terms, rule, precision).astype(np.float64)
         totals.used(rule, part.lanes(cells[:, active]))
         starts = np.arange(0, active.size, BLOCK)
-        step = slow * np.maximum.reduceat(np.abs(fine - values[:, active]).max(0), starts)
-        change, before = np.maximum(step, before / LUCK), step
-        size = np.maximum.reduceat(np.abs(fine).max(0), starts)
-        values[:, active] = fine
+        own = np.abs(fine)
+        # An absolute tolerance is one for a block, and so is the rounding beside it.
+        size = own if relative else np.repeat(np.maximum.reduceat(own.max(0), starts), BLOCK)[: active.size]
         rounding = ROUNDING[precision] * size
-        allowed = np.maximum(tolerance - rounding, rounding)
-        open_ = ~(change <= allowed)
-        done = float(np.max((change + rounding + floor * size)[~open_], initial=0.0))
-        totals.error = max(totals.error, done)
+        # 1e-300 stands for a value of 0 without an absolute tolerance, which agrees with 0 alone.
+        allowed = np.broadcast_to(
+            np.maximum(np.maximum(tolerance, relative * size) - rounding, np.maximum(rounding, 1e-300)), fine.shape
+        )
+        off = np.abs(fine - values[:, active])
+        ratio = np.where(off == 0, 0.0, off / allowed).max(0)
+        values[:, active] = fine
+        step = slow * np.maximum.reduceat(ratio, starts)
+        change, before = np.maximum(step, before / LUCK), step
+        open_ = ~(change <= 1)
         keep = np.repeat(open_, BLOCK)[: active.size]
-        change, before, rounding = change[open_], before[open_], (rounding + floor * size)[open_]
+        change = np.repeat(change, BLOCK)[: active.size]
+        stated = change * allowed + (ROUNDING[precision] + floor) * own
+        errors[active[~keep]] = stated[:, ~keep].max(0)
+        # At the end of the ladder differences add up.
+        left = (stated + (max(UNFINISHED / slow, 1) - 1) * change * allowed)[:, keep].max(0)
+        before = before[open_]
         active = active[keep]
         if active.size == 0:
             break
     if active.size and precision == 32 and part.device.fp64:
         # Whole ladders end within float32's reach or stop at its rounding: float64 goes on from here.
         totals.promoted += active.size
-        values[:, active] = climb(part, rows[:, active], tolerance, totals, 64)
+        found = climb_with_errors(part, rows[:, active], tolerance, totals, 64, relative)
+        values[:, active], errors[active] = found
     elif active.size:
-        left = float(np.max(max(UNFINISHED / slow, 1) * change + rounding))
-        if not np.isfinite(left):
+        if not np.isfinite(left).all():
             raise CheckError(
                 f"integral {part.entry.name} is not finite for some of these parameters in "
                 f"float{precision}{_example(part, rows, values)}"
             )
-        totals.error = max(totals.error, left)
-    return values
+        errors[active] = left
+    totals.error = max(totals.error, float(errors.max(initial=0.0)))
+    return values, errors
 
 
 def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
@@ -580,34 +684,43 @@ def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
     return ": " + ", ".join(f"{name} = {value:g}" for name, value in zip(names, rows[:, bad[0]], strict=True))
 
 
-def _at_grazing(part: Part, rows: np.ndarray, tolerance: float, totals: Totals) -> np.ndarray:
-    """Integrate as `climb` does, or by a kernel that is written for these models.
+def _at_grazing(
+    part: Part, rows: np.ndarray, tolerance: float, totals: Totals, relative: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrate as `climb_with_errors` does, or by a kernel that is written for these models.
 
     The value is infinite where a diffuse albedo is infinite at n·v = 0, as its closed form says (Minnaert's).
     """
     own_kernel, far = own_kernel_of(part.entry, part.slots), rows[0] >= CLOSED_FROM[0]
-    if own_kernel and tolerance >= CLOSED_FROM[1] and far.any():
-        values = np.empty((part.components, rows.shape[1]))
-        values[:, far] = climb(replace(part, closed=own_kernel), rows[:, far], tolerance, totals)
-        if not far.all():
-            values[:, ~far] = climb(part, rows[:, ~far], tolerance, totals)
-        return values
+    if own_kernel and max(tolerance, relative) >= CLOSED_FROM[1] and far.any():
+        values, errors = np.empty((part.components, rows.shape[1])), np.empty(rows.shape[1])
+        for some, how in ((far, replace(part, closed=own_kernel)), (~far, part)):
+            if some.any():
+                values[:, some], errors[some] = climb_with_errors(
+                    how, rows[:, some], tolerance, totals, relative=relative
+                )
+        return values, errors
     along = np.flatnonzero(rows[0] == 0) if "diffuse" in part.slots else np.empty(0, int)
     closed = part.slots["diffuse"].reference.get("albedo") if along.size else None
     if closed is None:
-        return climb(part, rows, tolerance, totals)
+        return climb_with_errors(part, rows, tolerance, totals, relative=relative)
     own = {p.name: rows[1 + k, along] for k, p in enumerate(part.slots["diffuse"].parameters)}
     with np.errstate(all="ignore"):
         infinite = along[np.isinf(closed(rows[0, along], **own))]
     rows[0, infinite] = 1  # any view that has an answer
-    values = climb(part, rows, tolerance, totals)
-    values[:, infinite] = np.inf
-    return values
+    values, errors = climb_with_errors(part, rows, tolerance, totals, relative=relative)
+    values[:, infinite], errors[infinite] = np.inf, 0.0
+    return values, errors
 
 
-def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, totals: Totals) -> np.ndarray:
-    """Return 2∫ E(μ) μ dμ with μ = x², (components, n), by rules of more and more nodes; the grazing end needs many."""
-    out = np.empty((part.components, end - begin))
+def _average(
+    part: Part, grid: Grid, begin: int, end: int, tolerance: float, totals: Totals, relative: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return 2∫ E(μ) μ dμ with μ = x², (components, n), and errors (n,), by rules of more and more nodes.
+
+    The grazing end needs many.
+    """
+    out, errors = np.empty((part.components, end - begin)), np.empty(end - begin)
     for some in _slices(begin, end, 512):
         rows = grid.rows(part, *some)
         before: np.ndarray | None = None
@@ -617,19 +730,25 @@ def _average(part: Part, grid: Grid, begin: int, end: int, tolerance: float, tot
             many = np.repeat(rows, count, 1)
             many[0] = np.tile(x * x, rows.shape[1])
             inner = Totals()
-            E = climb(part, many, tolerance / 2, inner).reshape(part.components, rows.shape[1], count)
+            E, off = climb_with_errors(part, many, tolerance / 2, inner, relative=relative / 2)
             totals.evaluations += inner.evaluations
             totals.promoted += inner.promoted
             totals.rule = inner.rule
-            value = E @ (4 * w * x**3)
-            step = np.inf if before is None else float(np.abs(value - before).max())
+            value = E.reshape(part.components, rows.shape[1], count) @ (4 * w * x**3)
+            within = off.reshape(-1, count).max(1) if relative else np.full(rows.shape[1], inner.error)
+            unit = np.maximum(tolerance, np.maximum(relative * np.abs(value), 1e-300))
+            with np.errstate(invalid="ignore", divide="ignore"):
+                ratio = 0.0 if before is None else np.where(value == before, 0.0, np.abs(value - before) / unit)
+            step = np.inf if before is None else float(np.max(ratio))
             change, last = max(step, last), step if before is not None else last
-            before = value
-            if change + inner.error <= max(tolerance, 2 * inner.error):
+            before, unit = value, unit.max(0)
+            stated = change * unit + within
+            if (stated <= np.maximum(unit, 2 * within)).all():
                 break
-        totals.error = max(totals.error, change + inner.error)
-        out[:, some[0] - begin : some[1] - begin] = value
-    return out
+        place = slice(some[0] - begin, some[1] - begin)
+        out[:, place], errors[place] = value, stated
+    totals.error = max(totals.error, float(errors.max()))
+    return out, errors
 
 
 def _slices(begin: int, end: int, step: int) -> Iterator[tuple[int, int]]:
@@ -642,7 +761,8 @@ def dfg(
     *,
     ndf: Spec = "ggx",
     masking: Spec = "smith",
-    tolerance: float = 5e-6,
+    tolerance: float | None = None,
+    relative_tolerance: float | None = None,
     precision: int = 32,
     device: Device | str | None = None,
 ) -> Integrated:
@@ -651,10 +771,12 @@ def dfg(
     size: texels on an edge, 1 to 4096. x is n·v = (x + ½)/size, and y is perceptual roughness r = (y + ½)/size, α = r²,
     with the smoothest in row 0.
     ndf, masking: models, as in `integrate`. E(v; F0) = F0·scale + bias for Schlick's Fresnel with F90 = 1.
-    tolerance, precision, device: as in `integrate`.
+    tolerance, relative_tolerance, precision, device: as in `integrate`, but 5e-6 where no tolerance is given.
 
     Raises the errors of `integrate`.
     """
+    if tolerance is None and relative_tolerance is None:
+        tolerance = 5e-6
     if not 1 <= size <= 4096:
         raise UsageError(f"dfg size {size} is outside [1, 4096]")
     axis = (np.arange(size) + 0.5) / size
@@ -665,6 +787,7 @@ def dfg(
         ndf=choice,
         masking=masking,
         tolerance=tolerance,
+        relative_tolerance=relative_tolerance,
         precision=precision,
         device=device,
         NoV=np.broadcast_to(axis, (size, size)),

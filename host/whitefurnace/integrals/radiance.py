@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import Integral, Model, integral
-from whitefurnace.catalogue.choice import Chosen, Spec, chosen, is_number
+from whitefurnace.catalogue.choice import Chosen, Spec, chosen
 from whitefurnace.catalogue.rule import Rule, gauss
 from whitefurnace.errors import UnsupportedError, UsageError
 from whitefurnace.integrals.outlines import outline, panels
@@ -27,12 +27,14 @@ from whitefurnace.integrals.quadrature import (
     Progress,
     TableSpec,
     Totals,
-    climb,
+    climb_with_errors,
     grid_of,
     parts_of,
     room_for,
+    room_for_errors,
     slots_of,
     summands_of,
+    tolerances,
 )
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import finest, unique_rows
@@ -106,9 +108,11 @@ def radiance(
     brdf: Spec | None = None,
     precision: int = 32,
     tolerance: float | None = None,
+    relative_tolerance: float | None = None,
     backfacing: str | None = None,
     device: Device | str | None = None,
     out: np.ndarray | None = None,
+    out_errors: np.ndarray | None = None,
     progress: Progress | None = None,
     **parameters: Any,
 ) -> Integrated:
@@ -119,9 +123,7 @@ def radiance(
     if (light is None) == (environment is None):
         raise UsageError("integral radiance needs either a light or an environment")
     defaults = DEFAULT_TOLERANCE if environment is None else ENVIRONMENT_TOLERANCE
-    tolerance = defaults[precision] if tolerance is None else tolerance
-    if not is_number(tolerance) or not 0 < tolerance < 1:
-        raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
+    tolerance, relative = tolerances(tolerance, relative_tolerance, defaults[precision])
     for name, value, default in (
         ("normal", normal, None),
         ("rotate", rotate, 0.0),
@@ -138,7 +140,10 @@ def radiance(
     on = device if isinstance(device, Device) else choose_device(device)
     if precision == 64 and not on.fp64:
         raise UnsupportedError(f"{on.identity()['name']} has no float64")
-    task = _Task(on, entry, slots, models, grid, precision, tolerance, progress)
+    errors = room_for_errors(grid.shape, out, out_errors)
+    if errors is not None:
+        errors[...] = 0
+    task = _Task(on, entry, slots, models, grid, precision, tolerance, relative, progress, errors)
     if environment is not None:
         return _environment_of(task, environment, normal, rotate, exposure, nonfinite, out, start)
     name = slots["light"].model.name
@@ -200,6 +205,8 @@ def _fill(
     for begin in range(0, grid.size, CELLS_A_TIME):
         end = min(begin + CELLS_A_TIME, grid.size)
         found = how(task, begin, end)
+        # The remaining error of float32 is the rounding of the values themselves.
+        task.note(begin, end, np.abs(found).max(0) * task.rounding)
         flat[begin:end] = found[np.arange(begin, end) % 3, np.arange(end - begin), None] if own else found.T
         if task.progress:
             task.progress(end / grid.size)
@@ -217,7 +224,9 @@ class _Task:
     grid: Grid
     precision: int
     tolerance: float
+    relative: float
     progress: Progress | None
+    cell_errors: np.ndarray | None = None  # of the grid's shape
     totals: Totals = field(default_factory=Totals)
     rule: str = ""
     errors: dict[str, float] = field(default_factory=dict)  # by summand
@@ -238,15 +247,28 @@ class _Task:
         sine = np.sqrt((1 - NoV) * (1 + NoV))
         return np.stack([sine * np.cos(phi), sine * np.sin(phi), NoV])
 
-    def state(self, summand: str, error: float) -> None:
-        """Take note of an error: the largest of a summand counts, and those of different summands add up."""
-        self.errors[summand] = max(self.errors.get(summand, 0.0), error)
+    def state(self, summand: str, errors: np.ndarray, begin: int, end: int) -> None:
+        """Take note of the errors of cells `begin` to `end` - 1.
+
+        In the total the largest of a summand counts, and those of different summands add up.
+        """
+        self.errors[summand] = max(self.errors.get(summand, 0.0), float(np.max(errors)))
+        self.note(begin, end, errors)
+
+    def note(self, begin: int, end: int, errors: np.ndarray) -> None:
+        """Add errors to those of cells `begin` to `end` - 1, without the total."""
+        if self.cell_errors is not None:
+            self.cell_errors.reshape(-1)[begin:end] += errors
+
+    @property
+    def rounding(self) -> float:
+        """Rounding of a value of 1 as it is written."""
+        return 6e-8 if self.precision == 32 else 1e-15
 
     def result(self, values: np.ndarray, start: float) -> Integrated:
         """Return the values with the error and the work so far; `start` is the clock's time at the beginning."""
         rule = self.totals.rule.name if self.totals.rule else self.rule
-        # The remaining error of float32 is the rounding of the values themselves.
-        rounding = float(np.abs(values).max()) * (6e-8 if self.precision == 32 else 1e-15)
+        rounding = float(np.abs(values).max()) * self.rounding
         return Integrated(
             values,
             sum(self.errors.values()) + rounding,
@@ -254,6 +276,7 @@ class _Task:
             time.perf_counter() - start,
             rule,
             self.totals.notices(),
+            self.cell_errors,
         )
 
 
@@ -318,31 +341,33 @@ def _punctual(task: _Task, begin: int, end: int) -> np.ndarray:
         function = "SPECULAR_F" if "ndf" in some else "DIFFUSE_F" if "diffuse" in some else "BRDF_F"
         f, error = _at(task, function, some, arguments, begin, end)
         value = np.where(lit > 0, math.pi * f * lit, 0.0)
-        size = float(np.abs(value).max())
-        if size > 0:  # the error of a half vector is that over the lobe's width, of the value
+        size = np.abs(value).max(0)
+        if size.max() > 0:  # the error of a half vector is that over the lobe's width, of the value
             widths = _widths(task, some, begin, end)
-            blur = float(_blur(widths, task.column("NoV", begin, end), finest(task.device)).max())
-            task.state(function, size * (error + 8 * blur))
+            blur = _blur(widths, task.column("NoV", begin, end), finest(task.device))
+            task.state(function, size * (error + 8 * blur), begin, end)
         total = total + value
     return total
 
 
 def _ambient(task: _Task, begin: int, end: int) -> np.ndarray:
     """The directional albedo times the radiance."""
-    E, error = _albedo(task, begin, end)
+    E, errors = _albedo(task, begin, end)
     L = task.light(begin, end)["radiance"]
-    task.state("albedo", error * float(L.max()))
+    task.state("albedo", errors * L, begin, end)
     return E * L
 
 
-def _albedo(task: _Task, begin: int, end: int) -> tuple[np.ndarray, float]:
-    """Return directional albedos (components, n) and their error."""
+def _albedo(task: _Task, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return directional albedos (components, n) and their errors (n,)."""
     if "albedo" not in task.parts:
         brdf = {slot: c for slot, c in task.slots.items() if slot != "light"}
         task.parts["albedo"] = parts_of(task.device, integral("albedo"), brdf, task.precision)
-    parts = task.parts["albedo"]
-    total = sum(climb(part, task.grid.rows(part, begin, end), task.tolerance, task.totals) for part in parts)
-    return np.asarray(total), task.totals.error * len(parts)
+    found = [
+        climb_with_errors(part, task.grid.rows(part, begin, end), task.tolerance, task.totals, relative=task.relative)
+        for part in task.parts["albedo"]
+    ]
+    return np.asarray(sum(values for values, _ in found)), np.asarray(sum(errors for _, errors in found))
 
 
 def _widths(task: _Task, slots: Mapping[str, Model], begin: int, end: int) -> np.ndarray:
@@ -444,7 +469,7 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
             _Outlined(task.device, task.entry, some, task.precision, light=model) for some in summands_of(task.slots)
         ]
     total: Any = 0.0
-    error = 0.0
+    errors = np.zeros(end - begin)
     for part in task.parts["area"]:
         assert isinstance(part, _Outlined)
         part.largest = 0.0
@@ -456,20 +481,22 @@ def _area(task: _Task, begin: int, end: int) -> np.ndarray:
         NoV = task.column("NoV", begin, end)
         sharp = np.zeros(end - begin, bool)
         if task.precision == 32 and task.device.fp64:
-            sharp = _blur(part.widths, NoV, 32) > task.tolerance
+            sharp = _blur(part.widths, NoV, 32) > max(task.tolerance, task.relative)
         values = np.empty((part.components, end - begin))
         for some, precision in ((~sharp, task.precision), (sharp, 64)):
             if some.any():
-                values[:, some] = climb(part, rows[:, some], task.tolerance, totals, precision)
-                totals.error += float(_blur(part.widths[some], NoV[some], precision).max())
+                values[:, some], off = climb_with_errors(
+                    part, rows[:, some], task.tolerance, totals, precision, task.relative
+                )
+                errors[some] += off + _blur(part.widths[some], NoV[some], precision)
         totals.promoted += int(sharp.sum())
-        error += totals.error + part.largest
+        errors += part.largest
         task.totals.evaluations += totals.evaluations
         task.totals.promoted += totals.promoted
         if totals.rule and (task.totals.rule is None or totals.rule.evaluations > task.totals.rule.evaluations):
             task.totals.rule = totals.rule
         total = total + values
-    task.state("area", error * float(light["radiance"].max()))
+    task.state("area", errors * light["radiance"], begin, end)
     return total * light["radiance"]
 
 
@@ -511,7 +538,13 @@ def _environment_of(
     values = _fill(task, mirror if smooth else lambda _, begin, end: texels.integral(begin, end), 3, out)
     result = task.result(values, start)
     return Integrated(
-        result.values, result.error, result.evaluations, result.seconds, task.rule, (*env.notices, *result.notices)
+        result.values,
+        result.error,
+        result.evaluations,
+        result.seconds,
+        task.rule,
+        (*env.notices, *result.notices),
+        result.errors,
     )
 
 
@@ -784,9 +817,9 @@ class _Texels:
         task = self.task
         total = np.zeros((3, end - begin))
         if self.base.any():
-            E, error = _albedo(task, begin, end)
+            E, errors = _albedo(task, begin, end)
             total += E * self.base[:, None]
-            task.state("albedo", error * float(self.base.max()) / self.scale)
+            task.state("albedo", errors * (float(self.base.max()) / self.scale), begin, end)
             task.rule = task.totals.rule.name if task.totals.rule else ""
         if self.rest.any():
             task.rule, rest = self._rest(begin, end)
@@ -799,8 +832,8 @@ class _Texels:
         widths = _widths(task, task.models, begin, end)
         total = np.zeros((3, end - begin))
         NoV = task.column("NoV", begin, end)
-        sharp = _blur(widths, NoV, task.precision) > task.tolerance
-        error, most = 0.0, 0
+        sharp = _blur(widths, NoV, task.precision) > max(task.tolerance, task.relative)
+        errors, most = np.zeros(end - begin), 0
         bound = task.tolerance * self.mean * self.scale
         for precision, cells_of in ((task.precision, ~sharp), (finest(task.device), sharp)):
             index = np.flatnonzero(cells_of)
@@ -823,15 +856,15 @@ class _Texels:
                         edge = 2 + 2 * cuts
                         value += self.near(group, terms, parts, edge, precision)
                         task.totals.evaluations += len(parts) * edge**2
-                    change = np.inf if before is None else float(np.abs(value - before).max())
-                    before = value
+                    off = np.full(len(some), np.inf) if before is None else np.abs(value - before).max(0)
+                    before, change = value, float(off.max())
                     most = max(most, cuts)
-                    if change <= bound or self.faces * self.rows * self.columns * (2 * cuts) ** 2 > MOST_NODES:
+                    agree = (off <= np.maximum(bound, task.relative * np.abs(value).max(0))).all()
+                    if agree or self.faces * self.rows * self.columns * (2 * cuts) ** 2 > MOST_NODES:
                         break
                     cuts *= 2
-                size = float(np.abs(value).max())
-                blur = float(_blur(widths[index[some]], NoV[index[some]], precision).max())
-                error = max(error, change + size * (ROUNDING[precision] + blur + table))
+                blur = _blur(widths[index[some]], NoV[index[some]], precision)
+                errors[index[some]] = change + np.abs(value).max(0) * (ROUNDING[precision] + blur + table)
                 total[:, index[some]] = value
-        task.state("texels", error / self.scale)
+        task.state("texels", errors / self.scale, begin, end)
         return f"texels-{most}x{most}", total

@@ -92,6 +92,7 @@ class Run:
     device     the device; None for a kind that needs none
     precision  32 or 64 bits
     tolerance  absolute tolerance
+    relative   tolerance relative to each value, or None
     out        array to fill, or None for a new one
     progress   called with the share of the work done
     """
@@ -101,8 +102,16 @@ class Run:
     tolerance: float
     out: np.ndarray | None = None
     progress: Callable[[float], None] | None = None
+    relative: float | None = None
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Return device, precision, tolerance and `out`, as `integrate` takes them."""
-        return {"device": self.device, "precision": self.precision, "tolerance": self.tolerance, "out": self.out}
+        """Return device, precision, tolerances and `out`, as `integrate` takes them."""
+        relative = {} if self.relative is None else {"relative_tolerance": self.relative}
+        return {
+            "device": self.device,
+            "precision": self.precision,
+            "tolerance": self.tolerance,
+            "out": self.out,
+            **relative,
+        }

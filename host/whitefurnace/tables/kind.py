@@ -48,6 +48,9 @@ class Kind:
     tolerance: float | None = None
     """The default tolerance in float32, absolute, where it is not that of integrals."""
 
+    relative: bool = False
+    """True if the tolerance may be relative to each value."""
+
     channels: int = 2
     """The number of values in a cell."""
 

@@ -94,6 +94,7 @@ def lut(
     backfacing: str | None = None,
     precision: int = 32,
     tolerance: float | None = None,
+    relative_tolerance: float | None = None,
     fit: str | None = None,
     as_read: bool = False,
     scheme: str | None = None,
@@ -119,6 +120,8 @@ def lut(
     light, environment, normal, rotate, exposure, nonfinite: the light of "radiance", as `integrate` takes it.
     backfacing: "clamp" or "absolute" accepts NoV < 0.
     precision: 32 or 64 bits. tolerance: absolute; 1e-6, or 1e-12 with 64 bits, unless the kind has its own.
+    relative_tolerance: largest error as a share of each value, instead of the absolute one, or beside it as in
+        `integrate`; for tables of integrals themselves.
     fit: "bilinear" fits the texels so that reads between them are most accurate. as_read: measure the error of such
         reads; a fit does.
     scheme: form of the table, where its kind has several. stored: pixel format, such as "rg16f" or "r8".
@@ -139,6 +142,7 @@ def lut(
     lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
     reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite, "backfacing": backfacing}
     accuracy: dict[str, Any] = {"precision": precision, "tolerance": tolerance, "fit": fit, "as_read": as_read}
+    accuracy["relative_tolerance"] = relative_tolerance
     form: dict[str, Any] = {"size": size, "axes": axes, "scheme": scheme, "stored": stored, "for_": for_}
     numbers = {**(parameters or {}), **fixed}
     request = TableRequest(kind, path, **models, **lit, **reading, **accuracy, **form, force=force, parameters=numbers)
@@ -205,7 +209,7 @@ def _made(
             if progress:
                 progress(request.path.name, "cells", share)
 
-        run = Run(on, request.precision, request.tolerance, out, report)
+        run = Run(on, request.precision, request.tolerance, out, report, request.relative)
         result, found = _fitted(request, run) if request.fit else request.kind.make(request.cells, run, True)
         facts.update(found)
         if request.as_read:

@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from whitefurnace.catalogue import integral
-from whitefurnace.catalogue.choice import chosen, is_number
+from whitefurnace.catalogue.choice import chosen
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.files import check_table, stored_format
 from whitefurnace.integrals.api import integrate
-from whitefurnace.integrals.quadrature import DEFAULT_TOLERANCE, TableSpec
+from whitefurnace.integrals.quadrature import DEFAULT_TOLERANCE, TableSpec, tolerances
 from whitefurnace.tables.axes import Axis, number, placed, size_of
 from whitefurnace.tables.cells import Cells
 from whitefurnace.tables.kind import Kind
 from whitefurnace.tables.kinds import kind as kind_of
-from whitefurnace.tables.kinds import scheme_of
+from whitefurnace.tables.kinds import kinds, scheme_of
 from whitefurnace.tables.request import TableRequest
 from whitefurnace.version import VERSION
 
@@ -56,6 +56,7 @@ class TablePlan:
     spec: TableSpec
     precision: int
     tolerance: float
+    relative: float | None
     fit: str | None
     as_read: bool
     stored: str | None
@@ -102,6 +103,7 @@ class TablePlan:
             "backfacing": cells.backfacing,
             "precision": self.precision,
             "tolerance": self.tolerance,
+            **({"relative_tolerance": self.relative} if self.relative is not None else {}),
             **({"fit": self.fit} if self.fit else {}),
             **({"as_read_stated": True} if self.as_read else {}),
             **({"scheme": cells.scheme} if cells.scheme else {}),
@@ -123,7 +125,7 @@ def plan(request: TableRequest) -> TablePlan:
     scheme = scheme_of(kind, request.scheme)
     path = Path(request.path)
     _check_file(kind, path, request.precision)
-    tolerance = _tolerance(kind, request)
+    tolerance, relative = _tolerances(kind, request)
     # Chosen once: a user's file is read once, so the key is that of the text that is used.
     models = {slot: chosen(slot, spec) for slot, spec in kind.specs(request).items()}
     fixed = {name: number(name, value) for name, value in (request.parameters or {}).items()}
@@ -138,7 +140,9 @@ def plan(request: TableRequest) -> TablePlan:
     cells = Cells(models, axes, fixed, scheme, request.backfacing, kind.lighting(request))
     spec = kind.spec(cells)
     stored = _check_shape(kind, path, axes, spec.shape, request.stored)
-    return TablePlan(kind, path, cells, spec, request.precision, tolerance, request.fit, as_read, stored, request.force)
+    return TablePlan(
+        kind, path, cells, spec, request.precision, tolerance, relative, request.fit, as_read, stored, request.force
+    )
 
 
 def _check_file(kind: Kind, path: Path, precision: int) -> None:
@@ -157,16 +161,15 @@ def _check_file(kind: Kind, path: Path, precision: int) -> None:
         raise UsageError(f"{kind.name} is written as coefficients, to .h or .npy, not {form}")
 
 
-def _tolerance(kind: Kind, request: TableRequest) -> float:
-    """The tolerance asked for, or the usual one. Raises UsageError."""
-    tolerance = request.tolerance
-    if tolerance is None:
-        tolerance = kind.usual_tolerance(request)
-    if tolerance is None:
-        tolerance = DEFAULT_TOLERANCE[request.precision]
-    if not is_number(tolerance) or not 0 < tolerance < 1:  # also NaN
-        raise UsageError(f"tolerance {tolerance!r} is outside (0, 1)")
-    return float(tolerance)
+def _tolerances(kind: Kind, request: TableRequest) -> tuple[float, float | None]:
+    """The absolute tolerance asked for, or the usual one, and the relative one. Raises UsageError."""
+    if request.relative_tolerance is not None and not kind.relative:
+        having = [other.name for other in kinds().values() if other.relative]
+        raise UsageError(f"{kind.name} has no relative tolerance; {', '.join(having[:-1])} and {having[-1]} have")
+    usual = kind.usual_tolerance(request)
+    usual = DEFAULT_TOLERANCE[request.precision] if usual is None else usual
+    absolute, relative = tolerances(request.tolerance, request.relative_tolerance, usual)
+    return absolute, relative or None
 
 
 def _check_axes(kind: Kind, path: Path, axes: tuple[Axis, ...], request: TableRequest) -> bool:

@@ -40,6 +40,7 @@ class TableRequest:
     backfacing: str | None = None
     precision: int = 32
     tolerance: float | None = None
+    relative_tolerance: float | None = None
     fit: str | None = None
     as_read: bool = False
     scheme: str | None = None

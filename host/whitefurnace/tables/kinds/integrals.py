@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 class OfIntegral(Kind):
     """A kind that tabulates the integral of its own name, for any BRDF that the integral takes."""
 
+    relative = True
+
     def integral(self, scheme: str | None) -> str:
         return self.name
 
