@@ -226,5 +226,63 @@ def tif(data: bytes, rng: random.Random) -> bytes:
     return bytes(out) + struct.pack("<H", len(tags)) + entries + struct.pack("<I", following)
 
 
-STRUCTURED = {".png": png, ".hdr": hdr, ".tif": tif}
+# --- JPEG and WebP ----------------------------------------------------------------------------------------
+
+
+def exif(rng: random.Random) -> bytes:
+    """Exif with an orientation, white and primaries, and a second directory of colour space, gamma and index."""
+    first = b"II*\0\x08\0\0\0" + struct.pack("<H", 3)
+    first += struct.pack("<HHII", 0x112, 3, 1, rng.choice((*range(10), 65535)))
+    first += struct.pack(
+        "<HHII", rng.choice((318, 319)), 5, rng.choice((2, 6, 0, 1 << 30)), rng.choice((0, 8, _number(rng)))
+    )
+    first += struct.pack("<HHII", 0x8769, 4, 1, rng.choice((50, 50, 50, 8, 0, _number(rng)))) + bytes(4)
+    second = struct.pack("<H", 3) + struct.pack("<HHII", 0xA001, 3, 1, rng.choice((0, 1, 2, 65535)))
+    second += struct.pack("<HHII", 0xA500, rng.choice((3, 5)), 1, rng.choice((0, 1, 2, 8, _number(rng))))
+    second += struct.pack("<HHII", 0xA005, 4, 1, rng.choice((92, 50, 8, _number(rng)))) + bytes(4)
+    third = struct.pack("<H", 1) + struct.pack("<HHI4s", 1, 2, 4, rng.choice((b"R03\0", b"R98\0"))) + bytes(4)
+    out = first + second + third
+    return out if rng.random() < 0.8 else out[: rng.randrange(len(out))]
+
+
+def jpg(data: bytes, rng: random.Random) -> bytes:
+    """Segments APP1 and APP2 after the first marker, with parts of profiles missing, repeated or misnumbered."""
+
+    def segment(marker: int, body: bytes) -> bytes:
+        return bytes((0xFF, marker)) + struct.pack(">H", len(body) + 2) + body
+
+    found = b""
+    if rng.random() < 0.7:
+        whole = icc(rng)
+        count = rng.choice((1, 1, 2, 3))
+        size = -(-len(whole) // count)
+        parts = [(k + 1, count, whole[k * size : (k + 1) * size]) for k in range(count)]
+        if rng.random() < 0.3:
+            parts = rng.choices(parts, k=rng.randrange(1, 4))
+        for number, of, part in parts:
+            head = bytes((number if rng.random() < 0.95 else rng.randrange(256), of if rng.random() < 0.95 else 255))
+            found += segment(0xE2, b"ICC_PROFILE\0" + head + part)
+    if rng.random() < 0.5:
+        found += segment(0xE1, b"Exif\0\0" + exif(rng))
+    if rng.random() < 0.2:
+        found += segment(rng.choice((0xE0, 0xE1, 0xE2, 0xEE)), rng.randbytes(rng.randrange(40)))
+    return data[:2] + found + data[2:]
+
+
+def webp(data: bytes, rng: random.Random) -> bytes:
+    """The extended form of a WebP, with a profile and Exif around the image."""
+
+    def part(kind: bytes, body: bytes) -> bytes:
+        return kind + struct.pack("<I", len(body)) + body + bytes(len(body) % 2)
+
+    flags = rng.choice((0x28, 0x20, 0x08, 0x2A, rng.randrange(256)))
+    body = part(b"VP8X", bytes((flags, 0, 0, 0)) + struct.pack("<I", 7)[:3] + struct.pack("<I", 3)[:3])
+    for _ in range(rng.choice((1, 1, 2))):
+        body += part(b"ICCP", icc(rng)) if rng.random() < 0.8 else b""
+    body += rng.choice((b"", b"", part(b"ANMF", rng.randbytes(16)) * 2)) + data[12:]
+    body += part(b"EXIF", rng.choice((b"", b"Exif\0\0")) + exif(rng)) if rng.random() < 0.6 else b""
+    return b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body
+
+
+STRUCTURED = {".png": png, ".hdr": hdr, ".tif": tif, ".jpg": jpg, ".webp": webp}
 """The mutation of each suffix; files of others are mutated byte by byte."""

@@ -345,8 +345,22 @@ def seeds(folder: Path) -> list[Path]:
     codes = np.arange(96, dtype=np.uint8).reshape(4, 8, 3)
     (folder / "a.png").write_bytes(encode_png(codes))
     write_hdr(folder / "a.hdr", codes / 8)
-    Image.fromarray(codes).save(folder / "a.tif")
-    named = ("a.npz", "b.npz", "a.npy", "m.json", "a.exr", "sh.txt", "t.h", "a.png", "a.hdr", "a.tif")
+    for name in ("a.tif", "a.jpg", "a.webp"):
+        Image.fromarray(codes).save(folder / name, lossless=True)
+    named = (
+        "a.npz",
+        "b.npz",
+        "a.npy",
+        "m.json",
+        "a.exr",
+        "sh.txt",
+        "t.h",
+        "a.png",
+        "a.hdr",
+        "a.tif",
+        "a.jpg",
+        "a.webp",
+    )
     return [*found, *(folder / name for name in named)]
 
 

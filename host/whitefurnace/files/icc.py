@@ -191,10 +191,9 @@ class _Profile:
         return Curve("a parametric curve", decode)
 
     def description(self) -> str:
-        """Return the profile's name in printable ASCII, empty where it has none."""
-        if b"desc" not in self.tags:
-            return ""
-        data = self.tag(b"desc")
+        """Return the profile's name in printable ASCII, empty where it has none that can be read."""
+        at, length = self.tags.get(b"desc", (0, 0))
+        data = self.data[at : at + length]
         text = ""
         if data[:4] == b"desc" and len(data) >= 12:
             (count,) = struct.unpack_from(">I", data, 8)

@@ -88,8 +88,10 @@ def chromaticities(tags: Mapping[int, Values], path: Path) -> tuple[npt.NDArray[
     """
     xy = [float(value) for value in (*tags.get(PRIMARIES, REC709[:6]), *tags.get(WHITE, REC709[6:]))]
     shown = " ".join(f"{value:.4g}" for value in xy[:8])
+    if len(xy) != 8:
+        raise InputError(f"{path} states white and primaries by {len(xy)} numbers, 2 and 6 were expected")
     try:
-        if len(xy) != 8 or not all(np.isfinite(xy)):
+        if not all(np.isfinite(xy)):
             raise ValueError
         return from_primaries(xy), shown
     except ValueError:
