@@ -114,7 +114,8 @@ def pairs(
     entry: Model, precision: int, lights: np.ndarray = COSINES
 ) -> tuple[list[np.ndarray], dict[str, np.ndarray], np.ndarray]:
     """(NoV, NoL, NoH, VoH, at_v, at_l), the model's parameters, and the α that made at_v and at_l."""
-    own = parameters(entry) or [np.array([1e-4, 0.03, 0.3, 1.0])]
+    own = parameters(entry)[:1] or [np.array([1e-4, 0.03, 0.3, 1.0])]
+    own += [np.array(p.typical) for p in entry.parameters[1:]]  # fewer, as cells multiply
     NoV, NoL, phi, *numbers = product(np.append(0.0, COSINES), lights, AZIMUTHS, *own)
     alpha = numbers[0]
     to_l, to_v = directions(NoL, NoV, phi)
