@@ -98,6 +98,14 @@ def from_table(c: float) -> float:
             lambda c: 3 * c,
         ),
         (
+            "const float[5] LOAD = float[5](4.0, 1.0, 3.0, 2.0, 2.5);\n"
+            + HEAD
+            + "{ float x = min(4.0 * cos_m, 3.999999), t[] = float[](0.0, 0x1p0); int k = int(x);\n"
+            "[unroll] for (int i = 0; i < 1; ++i) { t[1] *= 1.0; }\n"
+            "return mix(LOAD[k], LOAD[k + 1], (x - k) * t[1] + t[0]); }",
+            from_table,
+        ),
+        (
             HEAD + "{ vec3 a = vec3(cos_m), b = float3(1, 2, 3); real3 c = (real3)(0, 0, 1); "
             "return dot(a.rgb, b) + c.b + cross(a, a).y + length(vec2(3, 4)); }",
             lambda c: 6 * c + 6,
@@ -121,6 +129,7 @@ def from_table(c: float) -> float:
         "loop",
         "names of functions",
         "structures",
+        "arrays of GLSL",
         "vectors",
         "names of ours",
     ],

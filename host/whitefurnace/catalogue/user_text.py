@@ -69,6 +69,7 @@ _TOKEN = re.compile(
     |(?P<newline>\n)
     |(?P<space>[ \t\f\v]+)
     |(?P<string>"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')
+    |(?P<hexfloat>0[xX][0-9a-fA-F]*\.?[0-9a-fA-F]*[pP][+-]?\d+[fFlL]?(?!\w))
     |(?P<hex>0[xX][0-9a-fA-F]+[uUlL]*(?![\w.]))
     |(?P<float>(?:\d+\.\d*|\.\d+)(?:[eE][+-]?\d+)?(?:lf|LF|[fFhHdDlL])?(?!\w)|\d+[eE][+-]?\d+(?:lf|LF|[fFhHdDlL])?(?!\w)
         |\d+(?:lf|LF|[fFhH])(?!\w))
@@ -191,6 +192,7 @@ class UserText:
         self._functions: set[str] = set()
         self._variables: set[str] = set()
         self._note_declarations()
+        self._replaced = self._arrays() | self._attributes()
 
     def _at(self, n: int) -> Token:
         """The n-th token that is no space, or one of the kind "end" outside the text."""
@@ -330,9 +332,45 @@ class UserText:
                 places |= {k: k == n for k in range(n, end)}
         return places
 
+    def _arrays(self) -> dict[int, str]:
+        """The tokens of arrays as GLSL has them, by place, as C has them: `{1.0, 2.0}` for `float[2](1.0, 2.0)`."""
+        found: dict[int, str] = {}
+        for n, token in enumerate(self._solid):
+            if token.text not in self._types or self._at(n + 1).text != "[":
+                continue
+            close = n + 2 if self._at(n + 2).text == "]" else n + 3
+            if (
+                self._at(close).text == "]" and self._at(close + 1).kind == "name"
+            ):  # float[3] a, which C writes float a[3]
+                size = "".join(self._solid[k].text for k in range(n + 1, close + 1))
+                found |= dict.fromkeys(range(n + 1, close + 1), "") | {close + 1: self._name(close + 1) + size}
+            if self._at(close).text != "]" or self._at(close + 1).text != "(":
+                continue
+            depth, end = 1, close + 2
+            while depth and self._at(end).kind != "end":
+                depth += {"(": 1, ")": -1}.get(self._at(end).text, 0)
+                end += 1
+            found |= dict.fromkeys(range(n, close + 1), "") | {close + 1: "{", end - 1: "}"}
+        return found
+
+    def _attributes(self) -> dict[int, str]:
+        """The tokens of HLSL's attributes of statements, `[unroll]`, by place: nothing in C."""
+        return {
+            k: ""
+            for n, token in enumerate(self._solid)
+            if token.text in ("unroll", "loop", "branch", "flatten")
+            and (self._at(n - 1).text, self._at(n + 1).text) == ("[", "]")
+            and self._at(n - 2).text in (";", "{", "}", ")", "")
+            for k in (n - 1, n, n + 1)
+        }
+
     def _translated(self, n: int) -> str:
         """The translation of the n-th solid token."""
+        if n in self._replaced:
+            return self._replaced[n]
         token = self._at(n)
+        if token.kind == "hexfloat":
+            return f"((scalar){token.text})"
         if token.kind == "float":
             digits = re.sub("(?:lf|LF|[fFhHdDlL])$", "", token.text)
             return f"USER_NUMBER({digits if re.search('[.eE]', digits) else digits + '.0'})"
