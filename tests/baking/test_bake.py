@@ -545,7 +545,7 @@ BAD = {
     "corrupted png": (3, "checksum"),
     "lying": (3, "200000", "100000"),
     "lying png": (3,),
-    "NaN": (3, "nan", "(7, 5)", "--nonfinite"),
+    "NaN": (3, "nan", "(7, 5)", "--bad-pixels"),
     "inf": (3, "inf", "(7, 5)"),
     "negative": (3, "-1.0", "(7, 5)"),
     "aspect": (3, "40 x 32", "latlong 2:1"),

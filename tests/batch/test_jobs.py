@@ -347,7 +347,7 @@ def test_a_second_run_does_nothing_and_one_option_bakes_what_depends_on_it(tmp_p
     before = {name: (tmp_path / name).stat().st_mtime_ns for name in tree(tmp_path)}
     # Nothing is decoded for it.
     with monkeypatch.context() as patch:
-        patch.setattr(baking, "environment", lambda *_, **__: pytest.fail("an image was decoded"))
+        patch.setattr(baking, "read_environment", lambda *_, **__: pytest.fail("an image was decoded"))
         assert [batch.do(item).state for item in batch.job(path).items if item.source != "demo"] == ["skipped"] * 3
     assert shell("batch", path) == 0 and "4 items, all up to date" in shell.out
     assert {name: (tmp_path / name).stat().st_mtime_ns for name in tree(tmp_path)} == before
@@ -701,7 +701,7 @@ def test_a_source_that_changes_while_it_is_read_is_refused(tmp_path, monkeypatch
     with monkeypatch.context() as patch:
         patch.setattr(reader, "_read", same_times)
         stamps = environments._stamps
-        patch.setattr(environments, "_stamps", lambda p: tuple((s[0], s[1], s[2], s[3], s[3]) for s in stamps(p)))
+        patch.setattr(environments, "_stamps", lambda *p: tuple((*s[:4], s[3]) for s in stamps(*p)))
         with pytest.raises(FileError, match="changed while it was read"):
             bake(path, tmp_path / "out", **OPTIONS)
     (baked,) = bake(path, tmp_path / "out", **OPTIONS)

@@ -102,7 +102,7 @@ def test_every_option_is_explained_in_a_full_phrase(name):
 
 
 def test_an_option_that_commands_share_has_one_help():
-    for name in ("--device", "--json", "--rotate", "--nonfinite"):
+    for name in ("--device", "--json", "--rotate", "--bad-pixels"):
         having = [c for c in COMMANDS if any(name in p.opts for p in cli.commands[c].params)]
         assert len(having) > 1 and len({option(c, name) for c in having}) == 1, name
 

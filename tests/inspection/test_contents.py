@@ -17,11 +17,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from exr_writer import Part, exr, floats, planes
 from mutations import STRUCTURED
 from reference import cube_directions
 from whitefurnace import environment
 from whitefurnace.cli import main
-from whitefurnace.errors import FileError, InputError, UnsupportedError
+from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.files import (
     Texture,
     digest_file,
@@ -162,7 +163,7 @@ def test_what_is_wrong_with_values_is_counted(tmp_path):
     assert said.mean[0] == pytest.approx((total - 3 * omega[1, 1] + 65503 * omega[1, 1]) / total, rel=1e-12)
     text = shown(tmp_path / "a.ktx2")
     assert "3 NaN, 1 infinite, 1 negative, 2 at the format's limit, alpha 0.25 … 1" in text
-    with pytest.raises(InputError, match="--nonfinite zero"):
+    with pytest.raises(InputError, match="--bad-pixels zero"):
         environment(tmp_path / "a.ktx2")
     fixed = environment(tmp_path / "a.ktx2", nonfinite="zero")
     assert np.isfinite(fixed.texels).all() and fixed.texels.min() == 0 and len(fixed.notices) == 2
@@ -542,3 +543,47 @@ def test_the_digest_of_a_gltf_is_of_the_files_it_names_too(tmp_path):
     with contextlib.suppress(InputError):
         environment(tmp_path / "b.gltf")
     assert light_digest(tmp_path / "b.gltf") != first.digest
+
+
+def test_a_part_of_openexr_is_shown_and_compared(tmp_path, capsys):
+    beauty = np.random.default_rng(3).random((4, 8, 3)).astype(np.float32)
+    depth = Part({"Z": np.ones((4, 8), np.float32)}, "depth")
+    path = tmp_path / "a.exr"
+    path.write_bytes(exr(depth, Part(planes(beauty), "beauty"), Part(planes(2 * beauty), "lamp")))
+    found = contents(path)
+    assert found.kind == "lat-long" and np.array_equal(found.levels[0].texels, beauty)
+    assert "part beauty was read" in shown(path) and "(R G B)" in found.format
+    assert np.array_equal(contents(path, layer="lamp").levels[0].texels, 2 * beauty)
+    with pytest.raises(UsageError, match="did you mean 'lamp'"):
+        contents(path, layer="lump")
+    with pytest.raises(InputError, match="Z"):
+        contents(path, layer="depth")
+    with pytest.raises(SystemExit) as done:
+        main(["compare", str(path), str(path), "--layer-a", "lamp", "--max-error", "0.1"])
+    assert done.value.code == 7
+    with pytest.raises(SystemExit) as done:
+        main(["compare", str(path), str(path), "--layer-b", "beauty", "--max-error", "0"])
+    assert done.value.code == 0 and "part beauty was read" in capsys.readouterr().err
+    lamp = Part(planes(beauty), window=(0, 1), display=(0, 0, 7, 4))
+    path.write_bytes(exr(lamp))
+    with pytest.raises(InputError, match="--fill black"):
+        contents(path)
+    assert contents(path, fill="black").levels[0].texels.shape == (5, 8, 3)
+
+
+def test_attributes_of_openexr_that_are_not_ours_are_not_shown_as_ours(tmp_path):
+    """An attribute of our name that is an array of numbers."""
+    values = floats("m44f", *range(16))
+    for name in ("key", "version", "axes", "rule", "sh", "error", "method"):
+        path = tmp_path / f"{name}.exr"
+        pixels = np.ones((4, 8, 3), np.float32)
+        path.write_bytes(exr(Part(planes(pixels), attributes={f"whitefurnace:{name}": values})))
+        assert "lat-long in OpenEXR" in shown(path)
+
+
+def test_an_envmap_attribute_is_shown(tmp_path):
+    path = tmp_path / "a.exr"
+    for kind, shape, said in ((1, (24, 4), "openexr cube"), (0, (4, 8), "latlong"), (0, (24, 4), "contradicts")):
+        pixels = np.ones((*shape, 3), np.float32)
+        path.write_bytes(exr(Part(planes(pixels), attributes={"envmap": ("envmap", bytes([kind]))})))
+        assert said in shown(path)

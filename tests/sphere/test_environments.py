@@ -17,7 +17,11 @@ from whitefurnace.sphere.environments import (
     channel_range,
     cube_solid_angles,
     environment,
+    extent,
     latlong_solid_angles,
+    source_digest,
+    source_files,
+    source_name,
 )
 
 N = 8
@@ -360,7 +364,7 @@ def test_the_first_bad_pixel_is_named(tmp_path, value, shown, as_file):
         "channel G",
         "pixel (5, 3)",
         "first of 5",
-        "--nonfinite zero",
+        "--bad-pixels zero",
         *([str(source)] if as_file else []),
     )
     env = environment(source, nonfinite="zero")
@@ -435,3 +439,208 @@ def test_an_environment_is_frozen():
     assert isinstance(env, Environment)
     with pytest.raises(AttributeError):
         env.kind = "cube"  # type: ignore[misc]
+
+
+# --- bad pixels -----------------------------------------------------------------------------------------
+
+
+def test_negative_values_of_negligible_energy_become_zero_with_a_notice():
+    pixels = np.ones((64, 128, 3), np.float32)
+    pixels[30, 40, 1] = -0.01
+    pixels[31, 41] = -0.02
+    env = environment(pixels)
+    assert env.texels.min() == 0
+    # Their share of the energy by sin θ of the rows, over all other values.
+    ring = np.sin((np.arange(64) + 0.5) * np.pi / 64)
+    share = (0.01 * ring[30] + 3 * 0.02 * ring[31]) / (3 * 128 * ring.sum() - ring[30] - 3 * ring[31])
+    assert share < 2e-5
+    (notice,) = env.notices
+    assert "4 negative values" in notice and "-0.02" in notice and f"{share:.2g} of the energy" in notice
+    pixels[32, 42] = -1
+    share += 3 * ring[32] / (3 * 128 * ring.sum())
+    refused(InputError, pixels, "first of 7 values that are negative", f"{share:.1g}", "--bad-pixels")
+    for mode in ("zero", "clamp"):
+        assert environment(pixels, bad_pixels=mode).texels.min() == 0
+
+
+@pytest.mark.parametrize("kind", ["horizontal cross", "cube"])
+def test_the_share_of_negatives_in_a_cube_is_by_solid_angle(kind):
+    n = 32
+    cube = np.ones((6, n, n, 3), np.float32)
+    cube[2, 0, 0] = -0.5  # a corner texel has the least solid angle, .19 of that of the middle
+    angles = cube_solid_angles(n)
+    share = 0.5 * angles[0, 0] / (4 * math.pi - angles[0, 0])
+    source = cube if kind == "cube" else assemble(kind, cube)
+    cube[2, 0, 0] *= 1e-5 / share
+    source = cube if kind == "cube" else assemble(kind, cube)
+    (notice,) = environment(source).notices
+    assert "1e-05 of the energy" in notice
+    cube[2, 0, 0] *= 3
+    source = cube if kind == "cube" else assemble(kind, cube)
+    refused(InputError, source, "3e-05 of the energy")
+
+
+def test_black_with_a_negative_value_has_no_energy_and_is_refused():
+    pixels = np.zeros((4, 8, 3), np.float32)
+    pixels[0, 0] = -1e-30
+    refused(InputError, pixels, "negative")
+    assert environment(pixels, bad_pixels="zero").statistics["mean"] == [0, 0, 0]
+
+
+def test_negative_coverage_counts_for_itself():
+    pixels = np.ones((64, 128, 4), np.float32)
+    pixels[3, 3, 3] = -1e-3
+    env = environment(pixels)
+    assert env.coverage is not None and env.coverage[3, 3] == 0
+    pixels[..., 3] = -1e-3
+    refused(InputError, pixels, "channel A")
+
+
+@pytest.mark.parametrize("dtype, largest", [(np.float16, 65504), (np.float32, 3.4028235e38)])
+def test_clamp_sets_infinite_values_to_the_largest_of_the_type(dtype, largest):
+    pixels = np.ones((4, 8, 3), dtype)
+    pixels[0, 0] = np.inf, np.nan, -np.inf
+    refused(InputError, pixels, f"+inf to {largest:.6g}", "--bad-pixels clamp")
+    env = environment(pixels, bad_pixels="clamp")
+    np.testing.assert_array_equal(env.texels[0, 0], np.array([largest, 0, 0], np.float32))
+    assert ["1 +inf value was set to" in n or "2 not finite values were set to 0" in n for n in env.notices] == [1, 1]
+    assert environment(pixels, bad_pixels="zero").texels[0, 0].tolist() == [0, 0, 0]
+
+
+def test_the_older_name_of_bad_pixels():
+    pixels = np.full((1, 2, 3), np.nan)
+    assert environment(pixels, nonfinite="zero").texels.max() == 0
+    assert environment(pixels, bad_pixels="zero", nonfinite="zero").texels.max() == 0
+    refused(UsageError, pixels, "bad_pixels", "nonfinite", bad_pixels="clamp", nonfinite="zero")
+    refused(UsageError, pixels, "bad_pixels", "clamp", bad_pixels="keep")
+
+
+# --- layouts by name ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(8, 17), (8, 15), (9, 16), (8, 8), (5, 1)])
+def test_a_latlong_of_any_size_by_name(shape):
+    pixels = np.random.default_rng(2).random((*shape, 3), dtype=np.float32)
+    env = environment(pixels, layout="latlong")
+    assert env.kind == "latlong" and f"{shape[1]} x {shape[0]}" in env.notices[0]
+    np.testing.assert_array_equal(env.texels, pixels)
+
+
+@pytest.mark.parametrize("more", [(0, 1), (1, 0), (0, -1), (-1, 0), (1, 1)])
+@pytest.mark.parametrize("name", CUBES)
+def test_a_cube_layout_a_pixel_off_by_name(name, more):
+    """A texel of each face moves by less than one pixel."""
+    n = 16
+    want = code(cube_directions(n))
+    picture = assemble(name, want)
+    for axis, change in enumerate(more):
+        if change > 0:
+            picture = np.concatenate([picture, picture.take([-1], axis)], axis)
+        elif change < 0:
+            picture = picture.take(range(picture.shape[axis] - 1), axis)
+    refused(InputError, picture, "--layout")
+    short, option = name.split()[1], name.replace(" ", "-")
+    found = {}
+    for asked in (short, option):
+        try:
+            found[asked] = environment(picture, layout=asked)
+        except InputError as error:
+            assert "may differ by 1" in str(error)
+            h, w = picture.shape[:2]
+            columns, rows = next((one.columns, one.rows) for one in LAYOUTS if one.name == name)
+            assert abs(w / columns - h / rows) > 1
+            return
+    env = found[option]
+    np.testing.assert_array_equal(env.texels, found[short].texels)
+    size = env.texels.shape[1]
+    assert size in (n - 1, n) and env.layout == name
+    # By a pixel of 2/16, which is 1/16 in the code.
+    off = np.abs(env.texels - want[:, :size, :size])
+    assert off.max() <= 1.5 / n
+
+
+def test_a_layout_that_the_size_cannot_have(tmp_path):
+    pixels = np.ones((8, 16, 3), np.float32)
+    refused(InputError, pixels, "horizontal cross", "4 x 2.6667", "differ by 1", layout="cross")
+    refused(InputError, pixels, "horizontal strip", layout="strip")
+    refused(InputError, pixels, "faces", layout="faces")
+    refused(UsageError, pixels, "did you mean 'latlong'", layout="latlon")
+    refused(UsageError, np.ones((6, 4, 4, 3)), "cube", layout="latlong")
+    refused(UsageError, pixels, "layer", layer="beauty")
+    faces(tmp_path)
+    refused(InputError, tmp_path, "folder", layout="latlong")
+    assert environment(tmp_path, layout="faces").kind == "cube"
+
+
+# --- six files ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prefix", ["m0_", "Studio-", "a.b.", "probe ", "NAME"])
+@pytest.mark.parametrize(
+    "names", ["px nx py ny pz nz", "posx negx posy negy posz negz", "right left top bottom front back"]
+)
+def test_six_files_with_a_prefix(tmp_path, prefix, names):
+    want = code(cube_directions(4))
+    folder = tmp_path / "studio"
+    folder.mkdir()
+    for name, face in zip(names.split(), want, strict=True):
+        write_exr(folder / f"{prefix}{name}.exr", face)
+    (folder / "laptop.txt").write_text("not a face")
+    title = prefix.rstrip("_-. ")
+    one = folder / f"{prefix}{names.split()[4]}.exr"
+    for source in (folder, one, folder / f"{prefix}*.exr", str(folder / f"{prefix}*")):
+        env = environment(source)
+        assert (env.kind, env.layout, env.name) == ("cube", "six faces", title)
+        np.testing.assert_array_equal(env.texels, want)
+        assert source_name(source) == title and source_digest(source) == env.digest
+        assert len(source_files(source)) == 6 and extent(source) == ("cube", 4, 4)
+
+
+def test_one_of_two_sets_in_a_folder_is_asked_for(tmp_path):
+    for prefix in ("m0_", "m1_"):
+        for k, name in enumerate("px nx py ny pz nz".split()):
+            write_exr(tmp_path / f"{prefix}{name}.exr", np.full((4, 4, 3), k + 10 * int(prefix[1]), np.float32))
+    refused(InputError, tmp_path, "2 sets", "m0_px, m1_px", "m0_px.exr")
+    refused(InputError, tmp_path / "*.exr", "2 sets", "narrow")
+    for number in (0, 1):
+        for source in (tmp_path / f"m{number}_ny.exr", tmp_path / f"m{number}_*.exr"):
+            env = environment(source)
+            assert env.name == f"m{number}" and env.texels[3].max() == 3 + 10 * number
+    (tmp_path / "m1_nz.exr").unlink()
+    assert environment(tmp_path).name == "m0"
+    refused(InputError, tmp_path / "m1_px.exr", "4 x 4", "--layout")  # one of five is an image
+    refused(InputError, tmp_path / "m1_px.exr", "six images", layout="faces")
+    refused(InputError, tmp_path / "m1_*.exr", "lacks", "m1_nz")
+    refused(FileError, tmp_path / "m7_*.exr", "no file matches")
+
+
+def test_the_suffix_chooses_between_two_formats_of_one_set(tmp_path):
+    for name in "px nx py ny pz nz".split():
+        for suffix, value in (("exr", 1), ("dat", 2)):
+            write_exr(tmp_path / "new.exr", np.full((4, 4, 3), value, np.float32))
+            (tmp_path / "new.exr").rename(tmp_path / f"a_{name}.{suffix}")
+    assert environment(tmp_path / "a_px.exr").texels.max() == 1
+    assert environment(tmp_path / "a_nz.dat").texels.max() == 2
+    refused(InputError, tmp_path, "more than once", "a_px.dat and a_px.exr")
+
+
+def test_an_image_whose_name_ends_like_a_face_is_an_image(tmp_path):
+    for name in ("sunset_front", "bright", "laptop", "upright"):
+        write_exr(tmp_path / f"{name}.exr", np.ones((4, 8, 3), np.float32))
+        assert environment(tmp_path / f"{name}.exr").kind == "latlong"
+    refused(InputError, tmp_path, "sunset_right")
+    (tmp_path / "sunset_front.exr").unlink()
+    refused(InputError, tmp_path, "no cube faces")
+
+
+# --- the built-in environment ---------------------------------------------------------------------------
+
+
+def test_demo_is_an_environment_wherever_one_is_taken(device, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    env = environment("demo", device=device)
+    assert env.name == "demo" and env.texels.shape == (512, 1024, 3) and env.statistics["max_over_mean"] > 1e5
+    assert extent("demo") == ("latlong", 512, 1024) and source_files("demo") == {} and source_name("demo") == "demo"
+    assert environment("demo", rotate=90, device=device).rotation == pytest.approx(math.pi / 2)
+    write_exr(tmp_path / "demo", np.ones((2, 4, 3), np.float32))
+    assert environment("demo").texels.shape == (2, 4, 3)  # a file of that name comes first

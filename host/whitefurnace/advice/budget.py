@@ -3,13 +3,11 @@ tolerance."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 
 from whitefurnace.advice.choose import TOLERANCE_RANGE, Choice, choose
 from whitefurnace.advice.measure import Budget, Entry, ErrorMeter
 from whitefurnace.advice.points import ScenePoints, sample_points
-from whitefurnace.baking.bake import DEMO, demo
 from whitefurnace.engines.presets import Engine
 from whitefurnace.opencl.device import Device, choose_device
 from whitefurnace.prefiltering.recipe import Chain, chain
@@ -54,7 +52,7 @@ def of_image(
     `choose`, `environment` and `choose_device`.
     """
     on = choose_device(device)
-    env = demo(on) if source == DEMO and not os.path.exists(source) else environment(source)
+    env = environment(source, device=on)
     meter, recipe = ErrorMeter(scene, env, engine, on, without=without), usual(engine)
     return meter.budget(recipe), None if tolerance is None else choose(meter, tolerance, recipe)
 

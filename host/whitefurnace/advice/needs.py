@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from whitefurnace.baking.bake import DEMO
 from whitefurnace.baking.outputs import targets
 from whitefurnace.batch.jobs import MOST_BYTES, SECONDS
 from whitefurnace.catalogue.choice import chosen
@@ -24,6 +23,7 @@ from whitefurnace.prefiltering.plan import plan_chain
 from whitefurnace.prefiltering.recipe import DFG_SIZE, IRRADIANCE_SIZE, Chain, chain
 from whitefurnace.rendering.shading import SHADINGS, karis
 from whitefurnace.scenes.materials import Material, Scene, Spread
+from whitefurnace.sphere.environments import is_demo
 
 NEGLIGIBLE = 1 / 510
 """Half a step of 8 bits, in units of white. A weight below it changes no pixel."""
@@ -608,7 +608,7 @@ def write_job(
     if path.suffix.lower() != ".toml":
         raise UsageError(f"{path}: a job is a .toml file")
     folder = path.absolute().parent
-    sources = [one if one == DEMO and not os.path.exists(one) else _relative(one, folder) for one in environments]
+    sources = [one if is_demo(one) else _relative(one, folder) for one in environments]
     engine = _relative(name, folder) if name.lower().endswith(".toml") else name
     tables = [("bake", {"environments": sources, "for": [engine], **one}) for one in bakes(found, path.stem)]
     tables += [("lut", {**one, "output": f"{path.stem}/{one['output']}"}) for one in found.tables]

@@ -41,7 +41,17 @@ from whitefurnace.prefiltering.reading import Reader, compared
 from whitefurnace.prefiltering.recipe import CERTIFIED, DFG_SIZE, IRRADIANCE_SIZE, TOLERANCE_RANGE, Chain, chain
 from whitefurnace.results import Integrated
 from whitefurnace.sphere import harmonics as harmonic
-from whitefurnace.sphere.environments import Environment, check_options, environment, source_digest
+from whitefurnace.sphere.bad_pixels import check_bad_pixels
+from whitefurnace.sphere.environments import (
+    DEMO,
+    Environment,
+    Reading,
+    is_demo,
+    read_environment,
+    source_digest,
+    source_files,
+    source_name,
+)
 from whitefurnace.sphere.grids import Shape
 from whitefurnace.sphere.suns import Sun, sun_mode, without_sun
 from whitefurnace.tables.split_sum import SplitSum, split_sum
@@ -50,42 +60,10 @@ from whitefurnace.version import VERSION
 if TYPE_CHECKING:
     from whitefurnace.baking.request import Source
 
-DEMO = "demo"
-DEMO_HEIGHT = 512
-SUN_RADIUS = math.radians(0.2665)  # of the sun as seen from the earth
-SUN_RADIANCE = 4e5
 DFG_TOLERANCE = 5e-6
 SHEEN = 10
 """Factor on the tolerance that Charlie's levels are allowed: a sheen reflects a tenth of what GGX does, and where its
 smooth lobes are a rim at the horizon, no grid reaches 1e-3 under panels with sharp edges."""
-
-
-def demo(device: Device, height: int = DEMO_HEIGHT) -> Environment:
-    """Make the built-in environment: sky, ground, and a sun of more than 1e5 times the mean radiance.
-
-    height: rows of the lat-long. Raises DeviceError.
-    """
-    program = device.build(source.demo().text, {"W": 1, "T": 1, "PRECISION": 32})
-    # At the centre of a texel, so that the disc covers one whole and the maximum is the sun's own radiance.
-    theta = (round(0.29 * height) + 0.5) * math.pi / height
-    phi = (round(1.27 * height) + 0.5) * math.pi / height - math.pi
-    size = device.local_size
-    image = device.empty((height, 2 * height, 3), np.float32)
-    count = -(-2 * height * height // size) * size
-    sun = [math.sin(theta) * math.cos(phi), math.cos(theta), math.sin(theta) * math.sin(phi)]
-    device.launch(
-        program.kernel("demo"),
-        (count,),
-        (
-            image,
-            np.int32(height),
-            np.int32(4),
-            *(np.float32(x) for x in sun),
-            np.float32(math.cos(SUN_RADIUS)),
-            np.float32(SUN_RADIANCE),
-        ),
-    )
-    return replace(environment(image.read()), name=DEMO)
 
 
 @dataclass(frozen=True)
@@ -124,6 +102,7 @@ class BakePlan:
     sources  the environments
     engines  the target engines
     chains   the chain of each engine
+    reading  how environments are read
     The other fields are options of `bake`.
     """
 
@@ -132,9 +111,7 @@ class BakePlan:
     output: Path
     engines: tuple[Engine, ...]
     chains: tuple[Chain, ...]
-    rotate: float
-    exposure: float
-    nonfinite: str
+    reading: Reading
     sun: str
     force: bool
     as_read: bool = False
@@ -153,13 +130,14 @@ def plan(request: BakeRequest) -> BakePlan:
     """
     if not request.sources:
         raise UsageError("no environment was given")
-    names = [name_of(item) for item in request.sources]
+    reading = reading_of(request)
+    sources = _distinct(request.sources, reading.layout)
+    names = [name_of(item, reading.layout) for item in sources]
     seen: set[str] = set()
     for name in names:
         if name in seen:
             raise UsageError(f"two inputs are named {name!r}: their outputs would be the same files")
         seen.add(name)
-    check_options(request.rotate, request.exposure, request.nonfinite)
     sun_mode(request.sun)
     if request.samples and any(e.octahedral for e in engines(request.for_)):
         raise UnsupportedError("samples are not drawn for octahedral maps; give a tolerance")
@@ -173,13 +151,11 @@ def plan(request: BakeRequest) -> BakePlan:
         found = tuple(reduced(e, left_out, request.table) for e in found)
     return BakePlan(
         tuple(names),
-        tuple(request.sources),
+        tuple(sources),
         Path(request.output),
         found,
         tuple(_chain(e, request) for e in found),
-        float(request.rotate),
-        float(request.exposure),
-        request.nonfinite,
+        reading,
         request.sun,
         request.force,
         bool(request.as_read) or request.fit is not None,
@@ -187,16 +163,43 @@ def plan(request: BakeRequest) -> BakePlan:
     )
 
 
-def name_of(item: Any) -> str:
-    """Return the stem of the outputs of a source: a path's stem, "demo", "array", or an environment's own name.
+def reading_of(request: BakeRequest) -> Reading:
+    """Return how the environments of a request are read. Raises UsageError for an option out of its domain."""
+    return Reading(
+        request.rotate,
+        request.exposure,
+        check_bad_pixels(request.bad_pixels, request.nonfinite),
+        request.layout,
+        request.layer,
+        request.fill,
+    ).check()
+
+
+def _distinct(sources: Sequence[Source], layout: str | None) -> list[Source]:
+    """Return the sources in their order; six files of one cube, as a shell makes them of a pattern, are one source."""
+    found: list[Source] = []
+    sets: set[tuple[Path, ...]] = set()
+    for item in sources:
+        if isinstance(item, (str, os.PathLike)) and os.path.isfile(item):
+            files = tuple(source_files(item, layout).values())
+            if len(files) == 6 and Path(item) in files:
+                if files in sets:
+                    continue
+                sets.add(files)
+        found.append(item)
+    return found
+
+
+def name_of(item: Any, layout: str | None = None) -> str:
+    """Return the stem of the outputs of a source: a path's stem, the name of a set of six files, "demo", "array", or an
+    environment's own name.
 
     Raises UsageError for an object that is not a source and for a name that cannot be a file name.
     """
     if isinstance(item, Environment):
         name = item.name
     elif isinstance(item, (str, os.PathLike)):
-        path = Path(os.path.abspath(item))
-        name = DEMO if _is_demo(item) else path.name if path.is_dir() else path.stem
+        name = source_name(item, layout)
     elif isinstance(item, np.ndarray):
         name = "array"
     else:
@@ -239,11 +242,6 @@ def _chain(engine: Engine, request: BakeRequest) -> Chain:
         raise error if engine.container != "files" else UsageError(f"{engine.name}: {error}") from None
 
 
-def _is_demo(item: Any) -> bool:
-    """Return whether a source is the built-in environment: the word `demo`, unless a path of that name exists."""
-    return str(item) == DEMO and not os.path.exists(item)
-
-
 def bake(
     sources: Source | Sequence[Source],
     output: str | os.PathLike[str],
@@ -264,7 +262,11 @@ def bake(
     as_read: bool = False,
     rotate: float = 0.0,
     exposure: float = 0.0,
-    nonfinite: str = "refuse",
+    bad_pixels: str = "refuse",
+    layout: str | None = None,
+    layer: str | None = None,
+    fill: str | None = None,
+    nonfinite: str | None = None,
     sun: str = "keep",
     sh: str | None = None,
     force: bool = False,
@@ -274,7 +276,7 @@ def bake(
 ) -> list[Baked]:
     """Bake environments into the files that engines load, each with its stated error.
 
-    sources: a path, an array, an `environment`, or a list of them; the word `demo` is the built-in sky.
+    sources: a path, an array, an `environment`, or a list of them, as `environment` takes them.
     output: the folder of all files. They go to `output/ENGINE/STEM…`; the manifest `output/STEM.json` is written last
         and proves that they are complete. An environment whose manifest has the same key is skipped.
     for_: target engines or .toml files of your own, separated by commas.
@@ -287,7 +289,8 @@ def bake(
         "normal" (1e-3), "reference" (2e-5); or samples, 1 to 65536, for filtered importance sampling.
     certify: texels of each level whose error is measured, 299 to 1048576.
     fit: "read" fits the levels to how they are interpolated. as_read: measure the error after the engine's sampling.
-    rotate: degrees about +Y. exposure: stops. nonfinite: "refuse" or "zero". sun: "keep", "extract" or "clamp=X".
+    rotate: degrees about +Y. exposure: stops. bad_pixels (or nonfinite, its older name): "refuse", "zero" or "clamp".
+        layout, layer, fill: how an image is read, as for `environment`. sun: "keep", "extract" or "clamp=X".
     sh: "window=auto", "window=none" or "window=X", the window of engines' irradiance harmonics.
     force: bake again, and overwrite files that this tool did not write.
     device: a `Device`, or a number or part of a name. dry_run: only return the plan.
@@ -298,30 +301,14 @@ def bake(
     several: Sequence[Source] = (
         [sources] if isinstance(sources, (str, os.PathLike, np.ndarray, Environment)) else list(sources)
     )
-    asked = BakeRequest(
-        several,
-        output,
-        for_,
-        size,
-        min_size,
-        levels,
-        only_levels,
-        without,
-        table,
-        ndf,
-        tolerance,
-        quality,
-        samples,
-        certify,
-        fit,
-        as_read,
-        rotate,
-        exposure,
-        nonfinite,
-        sun,
-        sh,
-        force,
-    )
+    parts: dict[str, Any] = {"levels": levels, "only_levels": only_levels, "without": without, "table": table}
+    accuracy: dict[str, Any] = {"tolerance": tolerance, "quality": quality, "samples": samples, "certify": certify}
+    reads: dict[str, Any] = {"fit": fit, "as_read": as_read}
+    lit: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "sun": sun, "sh": sh}
+    pixels: dict[str, Any] = {"bad_pixels": bad_pixels, "nonfinite": nonfinite}
+    image: dict[str, Any] = {"layout": layout, "layer": layer, "fill": fill}
+    options = {**parts, **accuracy, **reads, **lit, **pixels, **image}
+    asked = BakeRequest(several, output, for_, size, min_size, ndf=ndf, force=force, **options)
     planned = plan(asked)
     return [bake_one(planned, k, device, dry_run=dry_run, progress=progress) for k in range(len(planned.names))]
 
@@ -434,15 +421,15 @@ def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: 
         or there is None
         or not isinstance(stated, dict)
         or not isinstance(item, (str, os.PathLike))
-        or _is_demo(item)
+        or is_demo(item)
     ):
         return None
     try:
-        digest = source_digest(item)
+        digest = source_digest(item, request.reading.layout)
     except WhitefurnaceError:  # reading it reports the error
         return None
-    turn = math.radians(math.remainder(request.rotate, 360.0))
-    recipe = _canonical(request, turn, request.exposure or 0.0)
+    turn = math.radians(math.remainder(request.reading.rotate, 360.0))
+    recipe = _canonical(request, turn, request.reading.exposure or 0.0)
     if there.get("key") != _key(digest, recipe) or not _output(request, k).is_whole(there):
         return None
     written = targets_of(request, request.names[k])
@@ -505,11 +492,10 @@ def _read(
 ) -> Baked | Loaded:
     name, item, output = request.names[k], request.sources[k], _output(request, k)
     on: Device | None = device if isinstance(device, Device) else None
-    if _is_demo(item):
+    if is_demo(item):
         on = on or choose_device(device if isinstance(device, str) else None)
-        item = demo(on)
     # With its rotation and exposure applied: the kernels see the environment only through these.
-    env = environment(item, rotate=request.rotate, exposure=request.exposure, nonfinite=request.nonfinite)  # type: ignore[arg-type]
+    env = read_environment(item, request.reading, device=on)
     env, sun = without_sun(env, request.sun)
     recipe = _canonical(request, env.rotation, env.exposure)
     key = _key(env.digest, recipe)
@@ -867,7 +853,7 @@ def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str,
         **({"sh": request.window} if own or request.window != "auto" else {}),
         "rotate": round(math.degrees(rotation), 9),
         "exposure": exposure,
-        "nonfinite": request.nonfinite,
+        **request.reading.recipe(),
         "sun": request.sun,
         "irradiance": IRRADIANCE_SIZE,
         **({"as_read": True} if request.as_read else {}),

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 class BakeRequest:
     """Every option of a bake with its default; `whitefurnace.bake` documents them.
 
-    Where `size`, `min_size`, `levels` or `table` is None, the engine's own value is used.
+    Where `size`, `min_size`, `levels` or `table` is None, the engine's own value is used. `nonfinite` is the older name
+    of `bad_pixels`.
     """
 
     sources: Sequence[Source]
@@ -43,7 +44,11 @@ class BakeRequest:
     as_read: bool = False
     rotate: float = 0.0
     exposure: float = 0.0
-    nonfinite: str = "refuse"
+    bad_pixels: str = "refuse"
+    layout: str | None = None
+    layer: str | None = None
+    fill: str | None = None
+    nonfinite: str | None = None
     sun: str = "keep"
     sh: str | None = None
     force: bool = False

@@ -45,7 +45,8 @@ from whitefurnace.files import (
 )
 from whitefurnace.opencl.device import device_address
 from whitefurnace.prefiltering.recipe import IRRADIANCE_SIZE
-from whitefurnace.sphere.environments import extent, source_files
+from whitefurnace.sphere.environments import DEMO, extent, is_demo, source_files, without_repeats
+from whitefurnace.sphere.layouts import SIX_FACES
 from whitefurnace.tables import lut as tables
 from whitefurnace.tables.axes import named, named_axes
 from whitefurnace.tables.request import TableRequest
@@ -463,9 +464,9 @@ class _Maker:
         relative = [os.path.relpath(t.path, output) for t in baking.targets_of(order, _STEM)] + [f"{_STEM}.json"]
         for one in relative:
             self._into((output / one).parent)
-        for source in sources:
+        for source in sources if table.layout not in (None, SIX_FACES) else without_repeats(sources):
             try:
-                name = baking.name_of(source)
+                name = baking.name_of(source, table.layout)
             except UsageError as error:
                 self.say(place, error)
                 continue
@@ -494,7 +495,7 @@ class _Maker:
         own = self.base / pattern
         if os.path.lexists(own):  # an existing path has priority over the word demo and over patterns
             return [str(own)]
-        if pattern == baking.DEMO:
+        if pattern == DEMO:
             return [pattern]
         if not re.search(r"[*?\[]", pattern):
             raise InputError(f"{pattern!r} is not there")
@@ -520,7 +521,7 @@ class _Maker:
         options |= models
         if table.for_ is not None and table.for_.lower().endswith(".toml"):
             options["for_"] = str(self.base / table.for_)
-        if table.environment is not None:
+        if table.environment is not None and not (table.environment == DEMO and not (self.base / DEMO).exists()):
             options["environment"] = str(self.base / table.environment)
         recipe = _encoded(options, {})
         try:
@@ -680,8 +681,8 @@ def named_files(options: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
     for name in options.get("for_", "").split(","):
         if name.lower().endswith(".toml"):
             found[name] = {os.path.basename(name): Path(name)}
-    if environment := options.get("environment"):
-        found[environment] = source_files(environment)
+    if (environment := options.get("environment")) and not is_demo(environment):
+        found[environment] = source_files(environment, options.get("layout"))
     return found
 
 
@@ -808,7 +809,7 @@ def prepare(item: Item) -> Prepared | Result:
     begin = time.perf_counter()
     try:
         _check_inside(item)
-        if item.kind == "lut" or item.source == baking.DEMO:
+        if item.kind == "lut" or item.source == DEMO:
             return Prepared(item, None, time.perf_counter() - begin)
         with _source(item) as source:
             found = baking.read(_one(item, source), 0)
@@ -892,8 +893,8 @@ def load(item: Item) -> Item:
     if not item.send:
         return item
     named = named_files(json.loads(item.recipe)["options"])
-    if item.kind == "bake" and item.source != baking.DEMO:
-        named[item.source] = source_files(item.source)
+    if item.kind == "bake" and item.source != DEMO:
+        named[item.source] = source_files(item.source, _one(item).reading.layout)
     size = sum(input_size(file) for parts in named.values() for file in parts.values())
     if size > MOST_SENT:
         raise InputError(f"{item.source} needs {size} bytes, at most {MOST_SENT} are sent; use a shared folder")
@@ -1016,8 +1017,7 @@ def predict(item: Item) -> Result:
         found = _of_baked(item, baking.status(order, 0), {})
         if found.state == "skipped":
             return found
-        height = baking.DEMO_HEIGHT
-        kind, rows, columns = ("latlong", height, 2 * height) if item.source == baking.DEMO else extent(item.source)
+        kind, rows, columns = extent(item.source, order.reading)
         latlong = kind == "latlong"
         texels = rows * columns * (1 if latlong else 6)
         levels = [level for _, level in baking.planned_levels(order, math.pi / rows / (1 if latlong else 2))]
@@ -1148,8 +1148,8 @@ def depfile(job: Job, results: Sequence[Result], path: str | os.PathLike[str]) -
         if result.state not in ("done", "skipped"):
             continue
         item = items[result.index]
-        made = item.kind == "lut" or item.source == baking.DEMO
-        inputs = [*common, *([] if made else _listed(item.source))]
+        made = item.kind == "lut" or item.source == DEMO
+        inputs = [*common, *([] if made else _listed(item))]
         needed |= dict.fromkeys(inputs)
         try:
             targets = " ".join(escaped(name, target=True) for name in (result.manifest, *result.files))
@@ -1167,12 +1167,12 @@ def depfile(job: Job, results: Sequence[Result], path: str | os.PathLike[str]) -
     return tuple(notices)
 
 
-def _listed(source: str) -> list[str]:
+def _listed(item: Item) -> list[str]:
     """Return the paths of the files that an environment was made from; its own where they cannot be found any more."""
     try:
-        return [str(file) for file in source_files(source).values()]
+        return [str(file) for file in source_files(item.source, _one(item).reading.layout).values()]
     except WhitefurnaceError:
-        return [source]
+        return [item.source]
 
 
 def escaped(name: str, *, target: bool = False) -> str:

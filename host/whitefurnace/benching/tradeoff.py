@@ -6,14 +6,12 @@ It marks the Pareto front, and measures how the time depends on the output size,
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from whitefurnace.baking.bake import DEMO, demo
 from whitefurnace.benching.throughput import Spread
 from whitefurnace.errors import CheckError
 from whitefurnace.opencl.device import Device
@@ -121,9 +119,7 @@ def front(points: Sequence[tuple[float, float]]) -> list[int]:
 
 def load(source: str, device: Device) -> Environment:
     """Read an environment into memory, from a path or the word `demo`. Raises the errors of `environment`."""
-    if source == DEMO and not os.path.exists(source):
-        return replace(demo(device), name=DEMO)
-    return environment(source)
+    return environment(source, device=device)
 
 
 def check(size: int, min_size: int) -> None:

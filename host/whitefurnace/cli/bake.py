@@ -15,7 +15,7 @@ from whitefurnace.errors import PartialError, WhitefurnaceError
 from whitefurnace.text import size, table
 
 if TYPE_CHECKING:
-    from whitefurnace.baking.bake import Baked
+    from whitefurnace.baking.bake import Baked, BakePlan
 
 EPILOG = """\b
 Examples:
@@ -119,7 +119,10 @@ OUTPUT, ACCURACY, ENVIRONMENT, LIGHT = "Output", "Accuracy", "Environment", "Sun
 @options.as_read("Also measure the total error after the engine's sampling. --fit and --dry-run always do.")
 @options.rotate(ENVIRONMENT)
 @options.exposure(ENVIRONMENT)
-@options.nonfinite(ENVIRONMENT)
+@options.bad_pixels(ENVIRONMENT)
+@options.layout(ENVIRONMENT)
+@options.layer(ENVIRONMENT)
+@options.fill(ENVIRONMENT)
 @options.option(
     "--sun",
     metavar="keep|extract|clamp=X",
@@ -163,7 +166,11 @@ def bake(
     as_read: bool,
     rotate: float,
     exposure: float,
-    nonfinite: str,
+    bad_pixels: str,
+    nonfinite: str | None,
+    layout: str | None,
+    layer: str | None,
+    fill: str | None,
     sun: str,
     sh: str,
     device: str | None,
@@ -175,8 +182,9 @@ def bake(
     """Bake environments into the files that engines load: the prefiltered specular chain, irradiance, spherical
     harmonics and the DFG table, each with its error.
 
-    ENV is an image (EXR, HDR, PNG, TIFF, ...) as a lat-long, a cross or a strip, a folder of six faces (px, nx, py,
-    ny, pz, nz), a texture (.ktx, .ktx2, .dds, .env, .gltf), or the word demo for the built-in sky.
+    ENV is an image (EXR, HDR, PNG, TIFF, ...) as a lat-long, a cross or a strip, six faces (NAME_px, NAME_nx, NAME_py,
+    ...) as their folder, a pattern or one of them, a texture (.ktx, .ktx2, .dds, .env, .gltf), or the word demo for the
+    built-in sky.
     """
     from whitefurnace.baking import bake as baking
     from whitefurnace.baking.request import BakeRequest
@@ -201,12 +209,23 @@ def bake(
             as_read=as_read,
             rotate=rotate,
             exposure=exposure,
+            bad_pixels=bad_pixels,
             nonfinite=nonfinite,
+            layout=layout,
+            layer=layer,
+            fill=fill,
             sun=sun,
             sh=sh,
             force=force,
         )
     )
+    _bake_all(planned, output, device, dry_run, as_json, quiet)
+
+
+def _bake_all(planned: BakePlan, output: Path, device: str | None, dry_run: bool, as_json: bool, quiet: bool) -> None:
+    """Bake every environment of a plan, and print each result or error."""
+    from whitefurnace.baking import bake as baking
+
     failures: list[WhitefurnaceError] = []
     with progress(not (quiet or as_json)) as report:
         for k, name in enumerate(planned.names):

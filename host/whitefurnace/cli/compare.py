@@ -54,6 +54,8 @@ def axes(letter: str, default: str) -> options.Decorator:
 )
 @axes("A", "[default: those of the engine that it was written for, else +x +y +z]")
 @axes("B", "[default: as for A]")
+@options.layer("Comparison", "--layer-a", "A, an OpenEXR file")
+@options.layer("Comparison", "--layer-b", "B, an OpenEXR file")
 @options.memory()
 @options.as_json()
 def compare(
@@ -63,6 +65,8 @@ def compare(
     max_error: float | None,
     axes_a: str | None,
     axes_b: str | None,
+    layer_a: str | None,
+    layer_b: str | None,
     as_json: bool,
 ) -> None:
     """Compare the cubes, lat-longs, tables or harmonics of two files, in whichever containers they are."""
@@ -73,7 +77,7 @@ def compare(
         raise UsageError(f"max-error {max_error} is outside [0, inf)")
     if folder is not None:
         plots_into(folder)
-    found = comparison.compare(contents(a), contents(b), axes_a=axes_a, axes_b=axes_b)
+    found = comparison.compare(contents(a, layer=layer_a), contents(b, layer=layer_b), axes_a=axes_a, axes_b=axes_b)
     for row in compared_rows(found) if as_json else ():
         print_row(row)
     for notice in found.notices:

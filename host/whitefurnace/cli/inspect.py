@@ -27,14 +27,16 @@ Exit codes: 0 done, 1 usage, 2 cannot read, 3 invalid input (truncated and corru
 
 @options.command("Look and compare", "Show what a texture, table or image contains", EPILOG)
 @click.argument("file", type=options.FilePath)
+@options.layer(options.RUNNING)
+@options.fill(options.RUNNING)
 @options.memory()
 @options.as_json()
-def inspect(file: Path, as_json: bool) -> None:
+def inspect(file: Path, layer: str | None, fill: str | None, as_json: bool) -> None:
     """Show what a texture, table or image contains: levels with their ranges, key-values, the engine it looks like, and
     the error that was stated when it was made."""
     from whitefurnace.inspection import contents
 
-    row = contents.described(contents.contents(file))
+    row = contents.described(contents.contents(file, layer=layer, fill=fill))
     if as_json:
         print_row(plain(row))
     else:

@@ -143,7 +143,10 @@ OUTPUT, AXES, MODELS, LIGHT, ACCURACY = "Output", "Axes", "Models", "Light (for 
 )
 @options.rotate(LIGHT)
 @options.exposure(LIGHT)
-@options.nonfinite(LIGHT)
+@options.bad_pixels(LIGHT)
+@options.layout(LIGHT)
+@options.layer(LIGHT)
+@options.fill(LIGHT)
 @options.tolerance(
     "Largest absolute error, above 0 and below 1. [default: 1e-6, or 1e-12 with --precision 64; some "
     "kinds have their own]"
@@ -198,7 +201,11 @@ def lut(
     normal: tuple[float, float, float] | None,
     rotate: float,
     exposure: float,
-    nonfinite: str,
+    bad_pixels: str,
+    nonfinite: str | None,
+    layout: str | None,
+    layer: str | None,
+    fill: str | None,
     tolerance: float | None,
     relative_tolerance: float | None,
     precision: int,
@@ -235,7 +242,11 @@ def lut(
             normal=normal,
             rotate=rotate,
             exposure=exposure,
+            bad_pixels=bad_pixels,
             nonfinite=nonfinite,
+            layout=layout,
+            layer=layer,
+            fill=fill,
             tolerance=tolerance,
             relative_tolerance=relative_tolerance,
             precision=precision,

@@ -180,15 +180,54 @@ def exposure(heading: str, what: str = "the radiance of the environment") -> Dec
     )
 
 
-def nonfinite(heading: str) -> Decorator:
-    """Return the option `--nonfinite`."""
+def bad_pixels(heading: str) -> Decorator:
+    """Return the options `--bad-pixels` and `--nonfinite`, its older name, which the help does not list."""
+
+    def both(function: Callable[..., Any]) -> Callable[..., Any]:
+        named = option(
+            "--bad-pixels",
+            metavar="refuse|zero|clamp",
+            default="refuse",
+            show_default=True,
+            heading=heading,
+            help="NaN, infinite and negative values in the environment: refuse the image, set them to zero, or clamp: "
+            "+inf becomes the largest value of the file's pixel type, the others zero. Negative values of up to 2e-5 "
+            "of the energy become zero in any case, with a notice. An older name is --nonfinite.",
+        )
+        return named(option("--nonfinite", hidden=True, heading=heading, help="Older name of --bad-pixels.")(function))
+
+    return both
+
+
+def layout(heading: str, what: str = "the environment") -> Decorator:
+    """Return the option `--layout`."""
     return option(
-        "--nonfinite",
-        metavar="refuse|zero",
-        default="refuse",
-        show_default=True,
+        "--layout",
+        metavar="NAME",
         heading=heading,
-        help="NaN, infinite and negative values in the environment: refuse the image, or set them to zero.",
+        help=f"Layout of {what}, in place of what its size or file says: latlong, cross, strip, row, column, faces "
+        "(six files), openexr-cube, horizontal-cross, vertical-cross, horizontal-strip or vertical-strip.",
+    )
+
+
+def layer(heading: str, name: str = "--layer", what: str = "an OpenEXR file") -> Decorator:
+    """Return the option `--layer`, or another name of it."""
+    return option(
+        name,
+        metavar="NAME",
+        heading=heading,
+        help=f"Part or layer of {what}. [default: the first part with R, G and B]",
+    )
+
+
+def fill(heading: str) -> Decorator:
+    """Return the option `--fill`."""
+    return option(
+        "--fill",
+        metavar="black",
+        heading=heading,
+        help="Read an image whose data window is smaller than its display window, with black around it. By default "
+        "it is refused.",
     )
 
 

@@ -14,7 +14,7 @@ from whitefurnace.files.gltf import Gltf
 from whitefurnace.files.gltf_lights import GltfLight, read_gltf_lights, write_gltf_lights
 from whitefurnace.files.harmonics import read_sh
 from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
-from whitefurnace.files.image import Image, decode_srgb, read_image, srgb_table
+from whitefurnace.files.image import Image, check_choice, decode_srgb, read_image, srgb_table
 from whitefurnace.files.inputs import head_of, input_size, inside, is_input, open_input, read_input, read_text
 from whitefurnace.files.lights import Deferred, Light, is_light, light_digest, light_files, read_light, read_radiance
 from whitefurnace.files.lock import Lock, acquire, is_lock, is_safe, lock_path, locks_in
@@ -43,6 +43,7 @@ __all__ = [
     "Texture",
     "Transaction",
     "acquire",
+    "check_choice",
     "check_table",
     "decode",
     "decode_srgb",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -51,7 +51,7 @@ def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Decla
     Raises `InputError` for what is neither read nor harmless. Adds sentences to `notices` for what is left out.
     """
     _check_aspect(spec, path)
-    _check_panorama(spec, path, notices)
+    check_panorama(spec, path, notices)
     channels = 3 if spec.nchannels >= 3 else 1
     associated = inverted = False
     encoding: Encoding | None
@@ -68,8 +68,6 @@ def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Decla
         encoding = _webp(path, channels)
     elif form == "bmp":
         encoding = _bmp(path, channels)
-    elif form == "openexr":
-        return Declared(_chromaticities(spec, path))
     else:
         if form == "psd":
             _check_psd(path)
@@ -90,12 +88,13 @@ def _check_aspect(spec: Any, path: Path) -> None:
         )
 
 
-def _chromaticities(spec: Any, path: Path) -> Encoding | None:
-    """Return the encoding of the attribute of EXR with CIE xy of red, green, blue and white."""
-    stated = spec.getattribute("chromaticities")
-    if stated is None or len(stated) != 8:
+def from_chromaticities(primaries: Sequence[float] | None, path: Path) -> Encoding | None:
+    """Return the encoding of linear values with CIE xy of red, green, blue and white; None where none are stated.
+
+    Raises `InputError` for primaries that span no colour space.
+    """
+    if primaries is None:
         return None
-    primaries = tuple(float(value) for value in stated)
     shown = " ".join(f"{value:g}" for value in primaries)
     try:
         matrix = from_primaries(primaries)
@@ -129,7 +128,7 @@ def _by_attributes(spec: Any, form: str, path: Path, channels: int) -> Encoding 
     return Encoding((curve,), f"its header (the colour space {space[:40]})")
 
 
-def _check_panorama(spec: Any, path: Path, notices: list[str]) -> None:
+def check_panorama(spec: Any, path: Path, notices: list[str]) -> None:
     """Refuse another projection than the lat-long, or a part of one, by the metadata GPano of panorama programs."""
     projection = str(spec.get_string_attribute("GPano:ProjectionType") or "equirectangular")
     if projection.lower() != "equirectangular":

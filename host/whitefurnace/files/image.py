@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from whitefurnace.errors import FileError, InputError
-from whitefurnace.files import memory
+from whitefurnace.errors import FileError, InputError, UsageError, nearest
+from whitefurnace.files import exr_parts, memory
 from whitefurnace.files.atomic import digest_file
 from whitefurnace.files.colour import LINEAR, SRGB_CURVE, Encoding
-from whitefurnace.files.declared import Declared, read_declared
+from whitefurnace.files.declared import Declared, check_panorama, from_chromaticities, read_declared
+from whitefurnace.files.exr_header import is_exr
 from whitefurnace.files.hdr_header import Radiance, read_radiance_header
 from whitefurnace.files.inputs import head_of, library_name, open_input
 from whitefurnace.files.integrity import check_file
@@ -38,6 +39,15 @@ _NOT_IMAGES = ("null", "zfile", "term")
 # hold files of another format (ICO).
 _UNREAD = ("cineon", "fits", "ico", "rla", "softimage")
 _SRGB = Encoding((SRGB_CURVE,), "sRGB")
+_FLOAT_MAX = float(np.finfo(np.float32).max)
+_HALF_MAX = 65504.0
+
+FILLS = ("black",)
+"""What the display window of an image can be filled with where its data window has no pixels."""
+
+_MOST_FILLED = 64
+"""Largest display window that is filled, over the pixels of the data window: a patch of 45° by 45° is 1/64 of a
+lat-long."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +59,9 @@ class Image:
     digest   sha256 of the file's bytes, in hex
     format   OpenImageIO's name of the file format
     notices  sentences about conversions and about data that was left out
+    layout   the layout that the file itself states, "latlong" or "openexr cube"; None where it states none
+    aspect   width of a pixel over its height, as an OpenEXR file states it; others must have square pixels
+    largest  the largest finite value that the file's pixels can hold
     """
 
     pixels: npt.NDArray[np.float32]
@@ -56,6 +69,9 @@ class Image:
     digest: str
     format: str
     notices: tuple[str, ...] = ()
+    layout: str | None = None
+    aspect: float = 1.0
+    largest: float = _FLOAT_MAX
 
 
 @cache
@@ -86,22 +102,35 @@ def _look_up(codes: npt.NDArray[Any], out: npt.NDArray[np.float32], tables: Sequ
         np.divide(codes[..., 3], np.float32(np.iinfo(codes.dtype).max), out=out[..., 3])
 
 
-def read_image(path: str | os.PathLike[str]) -> Image:
+def check_choice(layer: object, fill: object) -> None:
+    """Raise `UsageError` for a `layer` or a `fill` of `read_image` that is out of its domain."""
+    if layer is not None and (not isinstance(layer, str) or not layer):
+        raise UsageError(f"layer is {layer!r}, the name of a part or layer was expected")
+    if fill is not None and fill not in FILLS:
+        raise UsageError(f"fill is {fill!r}{nearest(str(fill), FILLS)}")
+
+
+def read_image(path: str | os.PathLike[str], *, layer: str | None = None, fill: str | None = None) -> Image:
     """Read an image as linear Rec.709 float32.
+
+    layer: name of the part or layer of an OpenEXR file; by default the first part with R, G and B. fill: "black" for
+    the pixels of the display window that the data window has not; such files are refused by default.
 
     Integers of 8 and 16 bits are decoded from sRGB, except a fourth channel; floats are taken as linear, unless the
     file states another encoding. Its ICC profile, code points, gamma, primaries, exposure and orientation are applied
     and named in the notices; docs/inputs.md lists them. Extra channels are left out with a notice. Raises `FileError`
     for a file that cannot be opened, and `InputError` for one that is not a valid image of 1, 3 or 4 channels with at
-    most 32768 x 16384 pixels and 65536 a side, or that states what is not read.
+    most 32768 x 16384 pixels and 65536 a side, or that states what is not read. Raises `UsageError` for a layer that
+    the file has not.
     """
+    check_choice(layer, fill)
     path = Path(path)
     size = _regular_size(path)
     if size == 0:
         raise InputError(f"{path} is empty, an image file was expected")
     digest = digest_file(path)
     try:
-        return _read(path, size, digest)
+        return _read(path, size, digest, layer, fill)
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror or error}") from error
     except UnicodeError as error:  # for example in the name of a channel
@@ -117,12 +146,16 @@ def _regular_size(path: Path) -> int:
 
 @dataclass(frozen=True)
 class Opened:
-    """An image file that OpenImageIO has opened: its object, specification and format; `radiance` of a .hdr alone."""
+    """An image file that OpenImageIO has opened: its object, specification and format.
+
+    radiance: of a .hdr alone. choice: the part and layer of an OpenEXR file; None where they hold no light.
+    """
 
     source: Any
     spec: Any
     form: str
     radiance: Radiance | None
+    choice: exr_parts.Choice | None = None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -140,11 +173,20 @@ class Opened:
 
 
 @contextlib.contextmanager
-def opened(path: Path, size: int, *, unassociated: bool = False) -> Iterator[Opened]:
+def opened(
+    path: Path,
+    size: int,
+    *,
+    unassociated: bool = False,
+    layer: str | None = None,
+    fill: str | None = None,
+    light: bool = True,
+) -> Iterator[Opened]:
     """Open an image file of `size` bytes, check its sizes and give it to a `with` statement.
 
-    unassociated: values come as stored, colour is not multiplied by coverage. Raises `FileError` and `InputError`, for
-    errors within the statement too.
+    unassociated: values come as stored, colour is not multiplied by coverage. layer, fill: as for `read_image`. light:
+    whether an OpenEXR file without light is refused. Raises `FileError` and `InputError`, for errors within the
+    statement too, and `UsageError` for a layer that the file has not.
     """
     import OpenImageIO as oiio
 
@@ -154,6 +196,7 @@ def opened(path: Path, size: int, *, unassociated: bool = False) -> Iterator[Ope
     with contextlib.ExitStack() as stack:
         head = head_of(path, 4096)
         check_file(path, size, head)
+        choice = _choice(path, size, head, layer, light)
         radiance = read_radiance_header(path) if head.startswith(b"#?") else None
         shown = path
         if radiance is not None:
@@ -167,13 +210,14 @@ def opened(path: Path, size: int, *, unassociated: bool = False) -> Iterator[Ope
         if source is None:
             raise _not_opened(complaint, path, shown, head)
         try:
-            spec, form = source.spec(), source.format_name()
+            spec, form = _chosen_spec(source, choice, path), source.format_name()
             if form in _NOT_IMAGES:
                 raise InputError(f"{path} is a file of kind {form}, an image of radiance was expected")
             if form in _UNREAD:
                 raise InputError(f"{path} is a file of kind {form}, whose statements of colour are not read; use EXR")
             _check_size(spec, path, size, form)
-            yield Opened(source, spec, form, radiance if form == "hdr" else None)
+            _check_windows(spec, path, fill)
+            yield Opened(source, spec, form, radiance if form == "hdr" else None, choice)
         except InputError as error:
             raise InputError(str(error).replace(str(path), str(shown))) from error
         finally:
@@ -189,15 +233,46 @@ def _not_opened(complaint: str, path: Path, shown: Path, head: bytes) -> InputEr
     return InputError(f"{shown} is not a valid image: {_reason(complaint, path)}")
 
 
-def _read(path: Path, size: int, digest: str) -> Image:
-    with opened(path, size, unassociated=True) as found:
+def _choice(path: Path, size: int, head: bytes, layer: str | None, light: bool) -> exr_parts.Choice | None:
+    """Choose the part and layer of an OpenEXR file that begins with `head`; None for a file of another format."""
+    if is_exr(head):
+        try:
+            return exr_parts.choose(path, size, layer)
+        except InputError:
+            if light or layer is not None:
+                raise
+            return None
+    if layer is not None:
+        raise UsageError(f"{path} is not OpenEXR and has no layer {layer!r}")
+    return None
+
+
+def _chosen_spec(source: Any, choice: exr_parts.Choice | None, path: Path) -> Any:
+    """Go to the chosen part and return its header; an environment map is all of its data window."""
+    if choice is not None and not source.seek_subimage(choice.part, 0):
+        raise InputError(f"{path} is not a valid image: {_reason(_complaint(source), path)}")
+    spec = source.spec()
+    if choice is not None and choice.layout is not None:
+        spec.full_x, spec.full_y, spec.full_width, spec.full_height = spec.x, spec.y, spec.width, spec.height
+    return spec
+
+
+def _read(path: Path, size: int, digest: str, layer: str | None, fill: str | None) -> Image:
+    with opened(path, size, unassociated=True, layer=layer, fill=fill) as found:
         return _decode(found, path, digest)
 
 
 def _decode(found: Opened, path: Path, digest: str) -> Image:
     source, spec, form = found.source, found.spec, found.form
     notices: list[str] = []
-    picks = _pick_channels(list(spec.channelnames), path, form, notices)
+    names, choice = list(spec.channelnames), found.choice
+    if choice is None:
+        picks = _pick_channels(names, path, form, notices)
+    elif set(choice.channels) <= set(names):
+        picks = [names.index(name) for name in choice.channels]
+        notices += choice.notices
+    else:
+        raise InputError(f"{path} is corrupted: its header names channels in two ways")
     pixel = str(spec.format)
     # Channels of an EXR may differ in type; OpenImageIO converts all to the type of the first.
     if pixel not in ("uint8", "uint16", "half", "float", "double"):
@@ -205,13 +280,16 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
     if found.radiance is not None:
         declared = Declared(found.radiance.encoding)
         notices += found.radiance.notices
+    elif choice is not None:
+        check_panorama(spec, path, notices)
+        declared = Declared(from_chromaticities(choice.primaries, path))
     else:
         declared = read_declared(path, form, spec, notices)
     # TIFF, PNG and WebP are looked at in `declared`; others have one image, or the whole one first.
     if form in ("gif", "jpegxl") and source.seek_subimage(1, 0):
         raise InputError(f"{path} holds several images or frames, a single one was expected")
     _complaint(source)
-    if int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
+    if choice is None and int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
         notices.append(f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read")
     pixels = _radiance(source, spec, picks, path, pixel, declared, notices)
     if found.radiance is not None:
@@ -222,7 +300,9 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
                 f"{path}: states the orientation {found.orientation}, 1 to 8 exist; its rows were taken as stored"
             )
         pixels = _upright(pixels, found.orientation)
-    return Image(pixels, path, digest, form, tuple(notices))
+    if choice is not None:
+        return Image(pixels, path, digest, form, tuple(notices), choice.layout, choice.aspect, choice.largest)
+    return Image(pixels, path, digest, form, tuple(notices), largest=_HALF_MAX if pixel == "half" else _FLOAT_MAX)
 
 
 def _radiance(
@@ -281,19 +361,27 @@ def _check_size(spec: Any, path: Path, size: int, form: str) -> None:
         raise InputError(
             f"{path} states a size of {width} x {height}, but its {size} bytes cannot hold that many pixels"
         )
+
+
+def _check_windows(spec: Any, path: Path, fill: str | None) -> None:
+    """Raise InputError where the data window lacks pixels of the display window that are not to be filled."""
     left, top = spec.full_x - spec.x, spec.full_y - spec.y
-    if (
-        spec.full_width < 1
-        or spec.full_height < 1
-        or left < 0
-        or top < 0
-        or left + spec.full_width > width
-        or top + spec.full_height > height
-    ):
-        raise InputError(
-            f"{path} has a data window of {width} x {height} at ({spec.x}, {spec.y}) that does not cover its "
-            f"display window of {spec.full_width} x {spec.full_height} at ({spec.full_x}, {spec.full_y})"
-        )
+    whole = left >= 0 and top >= 0 and left + spec.full_width <= spec.width and top + spec.full_height <= spec.height
+    if spec.full_width >= 1 and spec.full_height >= 1 and whole:
+        return
+    windows = (
+        f"{path} has a data window of {spec.width} x {spec.height} at ({spec.x}, {spec.y}) that does not cover its "
+        f"display window of {spec.full_width} x {spec.full_height} at ({spec.full_x}, {spec.full_y})"
+    )
+    if fill is None:
+        raise InputError(f"{windows}; --fill black has the missing pixels black")
+    columns = min(spec.x + spec.width, spec.full_x + spec.full_width) - max(spec.x, spec.full_x)
+    rows = min(spec.y + spec.height, spec.full_y + spec.full_height) - max(spec.y, spec.full_y)
+    if columns < 1 or rows < 1:
+        raise InputError(f"{windows}: they have no pixel in common")
+    texels = spec.full_width * spec.full_height
+    if max(spec.full_width, spec.full_height) > MAX_SIDE or texels > min(MAX_PIXELS, _MOST_FILLED * columns * rows):
+        raise InputError(f"{windows}: a display window of at most {_MOST_FILLED} times the pixels can be filled")
 
 
 def _pick_channels(names: list[str], path: Path, form: str, notices: list[str]) -> list[int]:
@@ -333,35 +421,41 @@ def _read_pixels(
 ) -> npt.NDArray[np.float32]:
     """Read the display window, (height, width, len(picks)); codes of integers are looked up in `tables`.
 
+    Pixels that the data window has not are 0.
     Rows are read in bands, so that memory of `out` is committed only for rows that the file holds; a header with a
     wrong size takes no memory.
     """
     first, last = min(picks), max(picks) + 1
-    columns = slice(spec.full_x - spec.x, spec.full_x - spec.x + spec.full_width)
-    begin, end = spec.full_y, spec.full_y + spec.full_height
+    left, right = max(spec.full_x, spec.x), min(spec.full_x + spec.full_width, spec.x + spec.width)
+    begin, end = max(spec.full_y, spec.y), min(spec.full_y + spec.full_height, spec.y + spec.height)
+    columns = slice(left - spec.x, right - spec.x)
     kind = pixel if pixel in ("uint8", "uint16") else "float"
     tile = spec.tile_height if spec.tile_width else 0
     # Bands are whole compressed blocks; the largest of EXR has 256 rows (DWAB). Tiles have their own height.
     unit = tile or max(1, min(int(spec.get_int_attribute("oiio:RowsPerChunk", 1)), 256))
     row = spec.width * (last - first) * 4
     rows = unit * max(1, _CHUNK_BYTES // (row * unit))
-    texels = (end - begin) * spec.full_width
+    texels = spec.full_height * spec.full_width
     # A band is there twice: as OpenImageIO's bytes and as the array that it is returned in.
     memory.require(
         4 * texels * len(picks) + 2 * row * min(rows, spec.height),
-        f"its {spec.full_width} x {end - begin} pixels of {len(picks)} channels",
+        f"its {spec.full_width} x {spec.full_height} pixels of {len(picks)} channels",
         path,
     )
-    out = np.empty((end - begin, spec.full_width, len(picks)), np.float32)
+    out = np.zeros((spec.full_height, spec.full_width, len(picks)), np.float32)
+    inner = out[begin - spec.full_y : end - spec.full_y, left - spec.full_x : right - spec.full_x]
     order = [pick - first for pick in picks]
     straight = order == list(range(last - first))
     # Bands start at whole blocks of the data window, which may begin above the display window.
+    part = source.current_subimage()
     for y in range(spec.y + (begin - spec.y) // unit * unit, end, rows):
         stop = min(y + rows, spec.y + spec.height)
         if tile:
-            band = source.read_tiles(0, 0, spec.x, spec.x + spec.width, y, stop, spec.z, spec.z + 1, first, last, kind)
+            band = source.read_tiles(
+                part, 0, spec.x, spec.x + spec.width, y, stop, spec.z, spec.z + 1, first, last, kind
+            )
         else:
-            band = source.read_scanlines(0, 0, y, stop, spec.z, first, last, kind)
+            band = source.read_scanlines(part, 0, y, stop, spec.z, first, last, kind)
         # OpenImageIO fills missing parts of a JPEG with grey and only sets an error message.
         if band is None or source.has_error:
             raise InputError(f"{path} is truncated or corrupted: {_reason(_complaint(source), path)}")
@@ -369,13 +463,13 @@ def _read_pixels(
         band = band[max(begin - y, 0) : min(stop, end) - y, columns]
         if not straight:
             band = band[..., order]
-        part = out[max(y, begin) - begin : min(stop, end) - begin]
+        piece = inner[max(y, begin) - begin : min(stop, end) - begin]
         if kind == "float":
-            if part.shape == out.shape and band.dtype == np.float32 and band.flags.c_contiguous:
+            if piece.shape == out.shape and band.dtype == np.float32 and band.flags.c_contiguous:
                 return band  # one band holds the whole image
-            part[...] = band
+            piece[...] = band
         else:
-            _look_up(band, part, tables)
+            _look_up(band, piece, tables)
     return out
 
 

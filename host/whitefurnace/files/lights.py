@@ -173,10 +173,11 @@ def _deferred(texture: Texture, k: int, name: str, said: list[str]) -> Deferred:
     return Deferred((*shape, texture.meaning.channels(FORMATS[texture.format].channels)), decoded)
 
 
-def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool, tuple[str, ...]]:
+def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool, tuple[str, ...], float]:
     """Read level 0 as radiance: (6, n, n, 1 | 3 | 4) and True for a cube, (h, w, 1 | 3 | 4) and False for an image.
 
-    The third value holds sentences about what the file states and what was applied. Raises the errors of `read_light`,
+    The third value holds sentences about what the file states and what was applied, the fourth is the largest finite
+    value that the format holds in each of R, G and B. Raises the errors of `read_light`,
     `InputError` for arrays and for textures of two channels, and `UnsupportedError` where the package that decodes the
     format is not installed.
     """
@@ -190,7 +191,7 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool, tuple[str
     if first.shape[-1] not in (1, 3, 4):
         raise InputError(f"{path} has {first.shape[-1]} channels ({light.format}), 1, 3 or 4 were expected")
     texels = first.decode() if isinstance(first, Deferred) else first
-    return np.ascontiguousarray(texels), light.cube, (*light.notices, *light.said)
+    return np.ascontiguousarray(texels), light.cube, (*light.notices, *light.said), min(light.largest[:3])
 
 
 def _env(source: Source) -> Light:

@@ -26,6 +26,8 @@ class ImageFacts:
     """Facts in the header of an image.
 
     format       OpenImageIO's name of the file format
+    layout       the layout that the file itself states, "latlong" or "openexr cube"; None where it states none
+    aspect       width of a pixel over its height, as an OpenEXR file states it
     pixel        type of a value, such as "half" or "uint8"
     compression  its name, empty where there is none
     attributes   the attributes that this package wrote, without their prefix
@@ -38,14 +40,21 @@ class ImageFacts:
     pixel: str
     compression: str = ""
     attributes: Mapping[str, str | float | int] = field(default_factory=dict)
+    layout: str | None = None
+    aspect: float = 1.0
 
 
-def image_facts(path: str | os.PathLike[str]) -> ImageFacts:
+def image_facts(
+    path: str | os.PathLike[str], *, layer: str | None = None, fill: str | None = None, light: bool = False
+) -> ImageFacts:
     """Read the facts in the header of an image.
 
+    layer, fill: as for `read_image`. light: whether an OpenEXR file without light is refused as `read_image` does;
+    otherwise the facts are those of its first part.
     Raises `FileError` for a file that cannot be read, and `InputError` for one that is not a valid image.
     """
-    with _opened(Path(path)) as (_, facts):
+    image.check_choice(layer, fill)
+    with _opened(Path(path), layer, fill, light) as (_, facts):
         return facts
 
 
@@ -56,8 +65,8 @@ def read_stored(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
     `image_facts`.
     """
     path = Path(path)
-    with _opened(path) as (source, facts):
-        return image._read_pixels(source, source.spec(), list(range(len(facts.channels))), path, "float")
+    with _opened(path) as (found, facts):
+        return image._read_pixels(found.source, found.spec, list(range(len(facts.channels))), path, "float")
 
 
 def read_rgbd(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
@@ -70,18 +79,23 @@ def read_rgbd(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[tuple[Any, ImageFacts]]:
+def _opened(
+    path: Path, layer: str | None = None, fill: str | None = None, light: bool = False
+) -> Iterator[tuple[image.Opened, ImageFacts]]:
     size = image._regular_size(path)
     if size == 0:
         raise InputError(f"{path} is empty, an image file was expected")
     try:
-        with image.opened(path, size) as found:
-            spec = found.spec
+        with image.opened(path, size, layer=layer, fill=fill, light=light) as found:
+            spec, choice = found.spec, found.choice
+            # Ours are texts and numbers; what another program stored under such a name, such as an array, is not ours.
             own: dict[str, Any] = {
-                a.name.removeprefix(PREFIX): a.value for a in spec.extra_attribs if a.name.startswith(PREFIX)
+                a.name.removeprefix(PREFIX): a.value
+                for a in spec.extra_attribs
+                if a.name.startswith(PREFIX) and isinstance(a.value, str | int | float)
             }
             yield (
-                found.source,
+                found,
                 ImageFacts(
                     found.form,
                     *found.size,
@@ -89,6 +103,8 @@ def _opened(path: Path) -> Iterator[tuple[Any, ImageFacts]]:
                     str(spec.format),
                     spec.get_string_attribute("compression"),
                     own,
+                    None if choice is None else choice.layout,
+                    1.0 if choice is None else choice.aspect,
                 ),
             )
     except OSError as error:

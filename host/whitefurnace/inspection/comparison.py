@@ -113,7 +113,8 @@ def compare(a: Contents, b: Contents, *, axes_a: str | None = None, axes_b: str 
     axes_a, axes_b: the axes in which a file is stored, where they differ from ours (`axes_of`).
     Raises UsageError for invalid axes, and UnsupportedError for contents that cannot be compared.
     """
-    notices: list[str] = []
+    # What was chosen and left out of an image, which begins with its path.
+    notices = [notice for found in (a, b) for notice in found.notices if notice.startswith(f"{found.path}: ")]
     a, b = (_in_ours(_parted(found), axes, notices) for found, axes in ((a, axes_a), (b, axes_b)))
     if "sheen" in (a.holds, b.holds) and a.holds != b.holds:
         notices.append(f"{a.path.name if a.holds == 'sheen' else b.path.name} holds Charlie's lobe, the other does not")

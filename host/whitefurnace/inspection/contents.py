@@ -171,15 +171,19 @@ class Contents:
         return self.kind in ("cube", "cube array")
 
 
-def contents(path: str | os.PathLike[str]) -> Contents:
+def contents(path: str | os.PathLike[str], *, layer: str | None = None, fill: str | None = None) -> Contents:
     """Read a file: .npz, .npy, .exr, .h and manifests of this tool, KTX 1, KTX 2, DDS, Babylon .env, glTF, or an image.
 
-    A file whose decoder is not installed has no levels, and a notice with the reason. Raises `FileError` for a file
-    that cannot be read, and `InputError` for one that is not valid or of an unknown format.
+    layer: name of the part or layer of an OpenEXR file. fill: "black" for pixels that the data window of an image has
+    not. A file whose decoder is not installed has no levels, and a notice with the reason. Raises `FileError` for a
+    file that cannot be read, `InputError` for one that is not valid or of an unknown format, and `UsageError` for a
+    layer that it has not.
     """
     path = Path(path)
     if path.is_dir():
         raise FileError(f"cannot read {path}: it is a folder, a file was expected")
+    if layer is not None:
+        return _of_image(path, _statement(path), layer, fill)
     if path.suffix.lower() == ".json" and not _is_harmonics(path):
         return _of_manifest(path)
     statement = _statement(path)
@@ -191,7 +195,7 @@ def contents(path: str | os.PathLike[str]) -> Contents:
         return _of_arrays(path, statement)
     if is_light(path):
         return _of_light(path, statement)
-    return _of_image(path, statement)
+    return _of_image(path, statement, layer, fill)
 
 
 # ------------------------------------------------------------------------------------------------- by container
@@ -413,8 +417,8 @@ def _light_kind(
     return "cube", (found[1],), (f"taken as a {found[0]}, by its aspect ratio",)
 
 
-def _of_image(path: Path, statement: Statement | None) -> Contents:
-    facts = image_facts(path)
+def _of_image(path: Path, statement: Statement | None, layer: str | None, fill: str | None) -> Contents:
+    facts = image_facts(path, layer=layer, fill=fill)
     attributes = dict(facts.attributes)
     if statement is None and attributes:
         statement = Statement(None, None, {**attributes, **_parsed(attributes)})
@@ -432,29 +436,35 @@ def _of_image(path: Path, statement: Statement | None) -> Contents:
         return Contents(
             path, "table", container, form, (level,), keys=keys, facts=shown, largest=limit, statement=statement
         )
-    image = read_image(path)
+    image = read_image(path, layer=layer, fill=fill)
     atlas = statement is not None and statement.stated.get("layout") == "octahedral"
-    found = None if atlas else faces_of(image.pixels)
+    found = None if atlas else faces_of(image.pixels, stated=image.layout)
+    said = []
+    if image.layout is not None:
+        fits = "" if found else ", which its size contradicts"
+        said.append(f"{path}: its envmap attribute says {image.layout}{fits}")
+    if image.aspect != 1:
+        said.append(f"{path}: states a pixel aspect ratio of {image.aspect:g}, which is not applied")
     name, texels = found if found is not None else ("", image.pixels)
     kind = "image" if not name or image.pixels.shape[:2] == (1, 1) else "lat-long" if name == "latlong" else "cube"
     if name or atlas:
         shown["layout"] = name or "octahedral maps of all levels"
     row = {**_stated_levels(statement).get(0, {}), **attributes}
-    level = Level("level 0", texels, _stated_number(row.get("roughness")), None, _figures(row))
+    first = Level("level 0", texels, _stated_number(row.get("roughness")), None, _figures(row))
     sh = attributes.get("sh")
     return Contents(
         path,
         kind,
         container,
         form,
-        (level,),
+        (first,),
         None,
         _sh_text(sh) if isinstance(sh, str) else None,
         keys=keys,
         facts=shown,
         largest=limit,
         statement=statement,
-        notices=image.notices,
+        notices=(*image.notices, *said),
     )
 
 

@@ -34,7 +34,11 @@ def integrate(
     normal: Sequence[float] | None = None,
     rotate: float = 0.0,
     exposure: float = 0.0,
-    nonfinite: str = "refuse",
+    bad_pixels: str = "refuse",
+    layout: str | None = None,
+    layer: str | None = None,
+    fill: str | None = None,
+    nonfinite: str | None = None,
     precision: int = 32,
     tolerance: float | None = None,
     relative_tolerance: float | None = None,
@@ -58,11 +62,11 @@ def integrate(
       radiance) or "rectangle" (center_x …, u_x …, v_x …, radiance), in the frame of the surface: n = +z, azimuths from
       +x. Without ndf, diffuse and brdf the surface is perfectly smooth, and the value is the mirror image times
       `fresnel`.
-    environment: the surroundings of radiance instead of a light: the path of an image, an array or an `environment`,
-      integrated over its texels. RGB is the last axis of the values.
+    environment: the surroundings of radiance instead of a light, as `environment` takes them, integrated over its
+      texels. RGB is the last axis of the values.
     normal: the normal of the surface in the world, (0, 1, 0) by default, for an environment. Azimuths run from +X to
       -Z, turned with the normal on the shortest way.
-    rotate, exposure, nonfinite: how the environment is read, as in `prefilter`.
+    rotate, exposure, bad_pixels, layout, layer, fill, nonfinite: how the environment is read, as in `environment`.
     parameters: `NoV`, the cosine of the view angle in [0, 1], where the integral has a view; `phi`, its azimuth in
       radians, for anisotropic models and radiance; and the models' own (`alpha`, `f0`). An unqualified name sets the
       parameter in every slot that has it, `ndf_alpha` in one. They broadcast like numpy arrays; RGB in a preset or
@@ -92,14 +96,22 @@ def integrate(
     course: dict[str, Any] = {"device": device, "out": out, "out_errors": out_errors, "progress": progress}
     lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
     if name != "radiance":
-        wrong = [key for key, value in lit.items() if value is not None]
-        if wrong:
+        if wrong := [key for key, value in lit.items() if value is not None]:
             raise UsageError(f"integral {name} has no {wrong[0]}; integral radiance has")
         return run.integrate(name, **models, **accuracy, **course, **parameters)
-    from whitefurnace.integrals.radiance import radiance
+    given = (rotate, exposure, bad_pixels, layout, layer, fill, nonfinite)
+    return _radiance(given, **lit, **models, **accuracy, **course, **parameters)
 
-    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite}
-    return radiance(**lit, **reading, **models, **accuracy, **course, **parameters)
+
+def _radiance(given: tuple[Any, ...], **others: Any) -> Integrated:
+    """Integrate radiance; `given` are the options of reading an environment."""
+    from whitefurnace.integrals.radiance import radiance
+    from whitefurnace.sphere.bad_pixels import check_bad_pixels
+    from whitefurnace.sphere.environments import Reading
+
+    rotate, exposure, bad_pixels, layout, layer, fill, nonfinite = given
+    mode = check_bad_pixels(bad_pixels, nonfinite)
+    return radiance(reading=Reading(rotate, exposure, mode, layout, layer, fill), **others)
 
 
 __all__ = ["integrate"]

@@ -9,7 +9,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -41,7 +41,7 @@ from whitefurnace.opencl.derived import finest, unique_rows
 from whitefurnace.opencl.device import Buffer, Device, choose_device
 from whitefurnace.opencl.launch import evaluate, over_nodes
 from whitefurnace.results import Integrated
-from whitefurnace.sphere.environments import Environment, environment
+from whitefurnace.sphere.environments import Environment, Reading, read_environment
 from whitefurnace.sphere.grids import composite, cube_directions, cube_tables, latlong_tables
 
 CELLS_A_TIME = 4096
@@ -98,9 +98,7 @@ def radiance(
     light: Spec | None = None,
     environment: Surroundings | None = None,
     normal: Sequence[float] | None = None,
-    rotate: float = 0.0,
-    exposure: float = 0.0,
-    nonfinite: str = "refuse",
+    reading: Reading | None = None,
     ndf: Spec | None = None,
     masking: Spec = "smith",
     fresnel: Spec = "one",
@@ -124,14 +122,12 @@ def radiance(
         raise UsageError("integral radiance needs either a light or an environment")
     defaults = DEFAULT_TOLERANCE if environment is None else ENVIRONMENT_TOLERANCE
     tolerance, relative = tolerances(tolerance, relative_tolerance, defaults[precision])
-    for name, value, default in (
-        ("normal", normal, None),
-        ("rotate", rotate, 0.0),
-        ("exposure", exposure, 0.0),
-        ("nonfinite", nonfinite, "refuse"),
-    ):
-        if light is not None and value != default:
-            raise UsageError(f"{name} is of an environment; a light is given in the frame of the surface")
+    reading = reading or Reading()
+    if light is not None:
+        given = ["normal"] if normal is not None else []
+        given += [one.name for one in fields(reading) if getattr(reading, one.name) != one.default]
+        if given:
+            raise UsageError(f"{given[0]} is of an environment; a light is given in the frame of the surface")
     entry = integral("radiance")
     smooth = ndf is None and diffuse is None and brdf is None
     slots = _chosen(light, ndf, masking, fresnel, diffuse, brdf)
@@ -145,7 +141,7 @@ def radiance(
         errors[...] = 0
     task = _Task(on, entry, slots, models, grid, precision, tolerance, relative, progress, errors)
     if environment is not None:
-        return _environment_of(task, environment, normal, rotate, exposure, nonfinite, out, start)
+        return _environment_of(task, environment, normal, reading, out, start)
     name = slots["light"].model.name
     how = _mirror if smooth else _punctual if name == "punctual" else _ambient if name == "ambient" else _area
     return task.result(_fill(task, how, 3 if "brdf" in slots else 1, out), start)
@@ -517,9 +513,7 @@ def _environment_of(
     task: _Task,
     given: Surroundings,
     normal: Sequence[float] | None,
-    rotate: float,
-    exposure: float,
-    nonfinite: str,
+    reading: Reading,
     out: np.ndarray | None,
     start: float,
 ) -> Integrated:
@@ -527,7 +521,7 @@ def _environment_of(
     nodes.
     """
     frame = frame_of((0.0, 1.0, 0.0) if normal is None else normal)
-    env = environment(given, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
+    env = read_environment(given, reading, device=task.device)
     texels = _Texels(task, env, frame)
 
     def mirror(task: _Task, begin: int, end: int) -> np.ndarray:

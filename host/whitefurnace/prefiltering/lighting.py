@@ -18,7 +18,8 @@ from whitefurnace.prefiltering.jobs import Job, chain_jobs, irradiance_job
 from whitefurnace.prefiltering.levels import Clock, run_jobs
 from whitefurnace.prefiltering.recipe import CERTIFIED, IRRADIANCE_SIZE, Chain, chain, samples_of, tolerance_of
 from whitefurnace.results import Integrated
-from whitefurnace.sphere.environments import Environment, environment
+from whitefurnace.sphere.bad_pixels import check_bad_pixels
+from whitefurnace.sphere.environments import Environment, Reading, read_environment
 from whitefurnace.sphere.grids import source_solid_angles
 
 
@@ -33,11 +34,13 @@ class Prefiltered:
     evaluations  number of lobe evaluations of the convolution
     seconds      wall time; `timings` splits it into "source" (bright texels, grids), "levels" and "certificate"
     rule         the method of each level
+    notices      sentences about how the environment was read
     """
 
     levels: tuple[Level, ...]
     seconds: float
     timings: dict[str, float]
+    notices: tuple[str, ...] = ()
 
     @property
     def values(self) -> tuple[np.ndarray, ...]:
@@ -234,20 +237,25 @@ def prefilter(
     certify: int = CERTIFIED,
     rotate: float = 0.0,
     exposure: float = 0.0,
-    nonfinite: str = "refuse",
+    bad_pixels: str = "refuse",
+    layout: str | None = None,
+    layer: str | None = None,
+    fill: str | None = None,
+    nonfinite: str | None = None,
     latlong: bool = False,
     device: Device | str | None = None,
 ) -> Prefiltered:
     """Prefilter the specular chain of an environment.
 
-    source: a path, an array or an `Environment`. size, min_size: texels of a face edge of the first and the last level,
-    powers of two. ndf: name or entry of an isotropic NDF. tolerance: bound on `error` of every level, 1e-3 by default.
-    quality: "draft", "normal" or "reference", instead of a tolerance. samples: number of filtered importance samples
-    for each texel, 1 to 65536, instead of both; `error` is then the error that they leave. levels: number of levels.
-    fit: "read" fits the levels so that interpolated roughness values are most accurate. certify: number of uniform
-    texels of each level's certificate, 299 or more; 0 for none, then `error`, `worst` and `rmse` are NaN and nothing is
-    refined. rotate: degrees about +Y. exposure: stops. nonfinite: "refuse" or "zero" for NaN and infinite texels.
-    latlong: make lat-long images of 2·size rows.
+    source: a path, an array, an `Environment` or the word `demo`. size, min_size: texels of a face edge of the first
+    and the last level, powers of two. ndf: name or entry of an isotropic NDF. tolerance: bound on `error` of every
+    level, 1e-3 by default. quality: "draft", "normal" or "reference", instead of a tolerance. samples: number of
+    filtered importance samples for each texel, 1 to 65536, instead of both; `error` is then the error that they leave.
+    levels: number of levels. fit: "read" fits the levels so that interpolated roughness values are most accurate.
+    certify: number of uniform texels of each level's certificate, 299 or more; 0 for none, then `error`, `worst` and
+    `rmse` are NaN and nothing is refined. rotate: degrees about +Y. exposure: stops. bad_pixels (or nonfinite, its
+    older name): "refuse", "zero" or "clamp" for texels that are not finite or negative. layout, layer, fill: how an
+    image is read, as for `environment`. latlong: make lat-long images of 2·size rows.
 
     Raises the errors of `environment`, UsageError, UnsupportedError, CheckError and DeviceError.
     """
@@ -263,14 +271,15 @@ def prefilter(
         fit=fit,
         certify=certify,
     )
-    env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
+    mode = check_bad_pixels(bad_pixels, nonfinite)
+    env = read_environment(source, Reading(rotate, exposure, mode, layout, layer, fill), device=device)
     clock = Clock()
     with clock("source"):
         convolver = Convolver(_device(device), env, precision=planning.precision_for(recipe.tolerance))
     made = run_jobs(
         convolver, chain_jobs(convolver, recipe, latlong=latlong), recipe.tolerance, certify=recipe.certify, clock=clock
     )
-    return Prefiltered(tuple(made), time.perf_counter() - begin, clock.seconds)
+    return Prefiltered(tuple(made), time.perf_counter() - begin, clock.seconds, env.notices)
 
 
 def irradiance(
@@ -281,7 +290,11 @@ def irradiance(
     samples: int | None = None,
     rotate: float = 0.0,
     exposure: float = 0.0,
-    nonfinite: str = "refuse",
+    bad_pixels: str = "refuse",
+    layout: str | None = None,
+    layer: str | None = None,
+    fill: str | None = None,
+    nonfinite: str | None = None,
     device: Device | str | None = None,
 ) -> Certified:
     """Compute the irradiance of an environment divided by π, as a cube (6, size, size, 3) float32.
@@ -294,7 +307,8 @@ def irradiance(
     begin = time.perf_counter()
     count = samples_of(samples, tolerance)
     bound = tolerance_of(tolerance, None)
-    env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
+    mode = check_bad_pixels(bad_pixels, nonfinite)
+    env = read_environment(source, Reading(rotate, exposure, mode, layout, layer, fill), device=device)
     convolver = Convolver(_device(device), env, precision=planning.precision_for(bound))
     level = run_jobs(convolver, [irradiance_job(convolver, size, bound, count)], bound)[0]
     return Certified(
@@ -303,6 +317,7 @@ def irradiance(
         level.pairs,
         time.perf_counter() - begin,
         level.method,
+        env.notices,
         worst=level.worst,
         rmse=level.rmse,
     )
@@ -313,7 +328,11 @@ def harmonics(
     *,
     rotate: float = 0.0,
     exposure: float = 0.0,
-    nonfinite: str = "refuse",
+    bad_pixels: str = "refuse",
+    layout: str | None = None,
+    layer: str | None = None,
+    fill: str | None = None,
+    nonfinite: str | None = None,
     device: Device | str | None = None,
 ) -> Certified:
     """Compute the spherical harmonics of an environment's radiance to degree 2, (9, 3) float64.
@@ -322,12 +341,12 @@ def harmonics(
     L11, L2-2, L2-1, L20, L21, L22. The parameters and the errors raised are those of `prefilter`.
     """
     begin = time.perf_counter()
-    env = environment(source, rotate=rotate, exposure=exposure, nonfinite=nonfinite)  # type: ignore[arg-type]
+    mode = check_bad_pixels(bad_pixels, nonfinite)
+    env = read_environment(source, Reading(rotate, exposure, mode, layout, layer, fill), device=device)
     convolver = Convolver(_device(device), env)
     values, error = convolver.harmonics()
-    return Certified(
-        values, error, env.texels.size // 3, time.perf_counter() - begin, "texel-nodes", worst=error, rmse=error
-    )
+    seconds = time.perf_counter() - begin
+    return Certified(values, error, env.texels.size // 3, seconds, "texel-nodes", env.notices, worst=error, rmse=error)
 
 
 def _device(device: Device | str | None) -> Device:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from whitefurnace.baking.bake import demo
 from whitefurnace.catalogue.choice import Chosen, Spec, chosen
 from whitefurnace.engines.presets import Engine
 from whitefurnace.errors import FileError, InputError, UsageError
@@ -27,7 +26,7 @@ from whitefurnace.rendering import shading
 from whitefurnace.rendering.shading import Lights
 from whitefurnace.rendering.truth import Points, Term, Truth, albedo, term
 from whitefurnace.scenes.material_spheres import DIELECTRIC, MaterialSphere, SphereLayout, layout_of
-from whitefurnace.sphere.environments import Environment, environment
+from whitefurnace.sphere.environments import Environment, Reading, read_environment
 from whitefurnace.sphere.grids import radiance_at
 from whitefurnace.sphere.suns import without_sun
 
@@ -337,19 +336,15 @@ def source_of(manifest: str | os.PathLike[str], given: str | os.PathLike[str], d
     """
     written = shading.dictionary(read_manifest(Path(manifest)))
     recipe, source = shading.dictionary(written.get("recipe")), shading.dictionary(written.get("source"))
-    item: Any = demo(device) if str(given) == "demo" and not Path(given).exists() else given
     stated: dict[str, float] = {}
     for name in ("rotate", "exposure"):
         value = recipe.get(name)
         if not isinstance(value, (int, float)):
             raise InputError(f"{manifest} does not state {name}: it is not the manifest of a bake")
         stated[name] = float(value)
-    found = environment(
-        item,
-        rotate=stated["rotate"],
-        exposure=stated["exposure"],
-        nonfinite="zero" if recipe.get("nonfinite") == "zero" else "refuse",
-    )
+    how = {name: recipe.get(name) for name in ("layout", "layer", "fill")}
+    mode = recipe.get("bad_pixels", recipe.get("nonfinite", "refuse"))  # the name in older manifests
+    found = read_environment(given, Reading(stated["rotate"], stated["exposure"], mode, **how), device=device)
     if found.digest != source.get("sha256"):
         raise InputError(
             f"{given} is not the image that {manifest} was baked from: its sha256 is {found.digest[:16]}…"

@@ -9,71 +9,107 @@ import hashlib
 import math
 import os
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import (
+    check_choice,
     decode_srgb,
     digest_file,
     image_facts,
-    inside,
     is_light,
     light_digest,
     light_files,
     read_image,
     read_radiance,
 )
-
-FACES = ("+X", "-X", "+Y", "-Y", "+Z", "-Z")
-FACE_NAMES = (
-    ("px", "nx", "py", "ny", "pz", "nz"),
-    ("posx", "negx", "posy", "negy", "posz", "negz"),
-    ("right", "left", "top", "bottom", "front", "back"),
+from whitefurnace.sphere.bad_pixels import check_bad_pixels, clean
+from whitefurnace.sphere.faces import FACE_NAMES, face_files, without_repeats
+from whitefurnace.sphere.layouts import (
+    FACES,
+    LAYOUTS,
+    SIX_FACES,
+    Layout,
+    check_layout,
+    faces_of,
+    layout_of,
+    placed,
 )
+from whitefurnace.sphere.solid_angles import cube_solid_angles, latlong_solid_angles
 
+if TYPE_CHECKING:
+    from whitefurnace.opencl.device import Device
 
-class Cell(NamedTuple):
-    """The place of a face in an image: `turns` quarter turns counter-clockwise bring it upright."""
+__all__ = [
+    "DEMO",
+    "FACES",
+    "FACE_NAMES",
+    "LAYOUTS",
+    "Environment",
+    "Reading",
+    "channel_range",
+    "cube_solid_angles",
+    "demo",
+    "environment",
+    "extent",
+    "faces_of",
+    "is_demo",
+    "latlong_solid_angles",
+    "read_environment",
+    "source_digest",
+    "source_files",
+    "source_name",
+    "statistics_of",
+    "without_repeats",
+]
 
-    column: int
-    row: int
-    turns: int = 0
+DEMO = "demo"
+"""The name of the built-in environment, where there is no file of that name."""
 
-
-class Layout(NamedTuple):
-    """A placement of faces in an image, recognized by its aspect ratio `columns` : `rows`.
-
-    cells: cells of the faces +X -X +Y -Y +Z -Z; none for a lat-long.
-    """
-
-    name: str
-    columns: int
-    rows: int
-    cells: tuple[Cell, ...] = ()
-
-
-# Faces are seen from inside, upright as in GL-direct, and cross faces join at the edges they share on the
-# sphere: +Z is in the middle with +Y above it. In a vertical cross -Z hangs below -Y, upside down.
-LAYOUTS = (
-    Layout("latlong", 2, 1),
-    Layout("horizontal cross", 4, 3, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(3, 1))),
-    Layout("vertical cross", 3, 4, (Cell(2, 1), Cell(0, 1), Cell(1, 0), Cell(1, 2), Cell(1, 1), Cell(1, 3, 2))),
-    Layout("horizontal strip", 6, 1, tuple(Cell(face, 0) for face in range(6))),
-    Layout("vertical strip", 1, 6, tuple(Cell(0, face) for face in range(6))),
-)
-_CHANNELS = "RGBA"
 _BLOCK = 1 << 16  # texels looked at together: three channels in float64 stay in a core's cache
 _RUN = 64  # texels of which the largest stands for all
 _BRIGHTEST = 64
-_KEPT_SIZE = 512  # faces of up to 2 MiB of solid angles are kept: every level and image asks for the same
-_FLOAT_MAX = np.finfo(np.float32).max
+_FLOAT_MAX = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a source is read; `environment` says what each option means.
+
+    bad_pixels: "refuse", "zero" or "clamp". layout: a name of `layouts.CHOICES`. fill: "black". None leaves it to the
+    file.
+    """
+
+    rotate: float = 0.0
+    exposure: float = 0.0
+    bad_pixels: str = "refuse"
+    layout: str | None = None
+    layer: str | None = None
+    fill: str | None = None
+
+    def check(self) -> Reading:
+        """Return it. Raises `UsageError` for an option that is out of its domain."""
+        if not _is_number(self.rotate):
+            raise UsageError(f"rotate is {self.rotate!r}, a finite angle in degrees was expected")
+        if not _is_number(self.exposure) or abs(self.exposure) > 64:
+            raise UsageError(f"exposure is {self.exposure!r}, a number of EV in [-64, 64] was expected")
+        check_bad_pixels(self.bad_pixels)
+        check_layout(self.layout)
+        check_choice(self.layer, self.fill)
+        return self
+
+    def recipe(self) -> dict[str, str]:
+        """The options that choose texels and their values, for the key of what is made of them."""
+        return {
+            "bad_pixels": self.bad_pixels,
+            **{name: value for name in ("layout", "layer", "fill") if (value := getattr(self, name)) is not None},
+        }
 
 
 @dataclass(frozen=True)
@@ -107,64 +143,63 @@ class Environment:
     statistics: dict[str, Any] = field(default_factory=dict)
 
 
-def latlong_solid_angles(height: int, width: int) -> npt.NDArray[np.float64]:
-    """Return the solid angle, in steradians, of one texel in each row of a lat-long: (height,).
-
-    It is (2π/width)(cos θ0 - cos θ1) for the polar angles of the row's edges.
-    """
-    centre = (np.arange(height) + 0.5) * (math.pi / height)
-    # As a product of sines: the difference of cosines cancels at the poles.
-    return (2 * math.pi / width) * 2 * np.sin(centre) * math.sin(0.5 * math.pi / height)
-
-
-def cube_solid_angles(size: int) -> npt.NDArray[np.float64]:
-    """Return the solid angles, in steradians, of the texels of one cube face: (size, size), read-only.
-
-    They are differences over the corners of atan(x y/√(1 + x² + y²)), the solid angle between the face's centre and (x,
-    y).
-    """
-    return _kept_solid_angles(size) if size <= _KEPT_SIZE else _cube_solid_angles(size)
-
-
-@lru_cache(maxsize=12)
-def _kept_solid_angles(size: int) -> npt.NDArray[np.float64]:
-    angles = _cube_solid_angles(size)
-    angles.flags.writeable = False
-    return angles
-
-
-def _cube_solid_angles(size: int) -> npt.NDArray[np.float64]:
-    edge = np.arange(size + 1) * (2 / size) - 1
-    x, y = edge[None, :], edge[:, None]
-    corner = np.arctan(x * y / np.sqrt(1 + x * x + y * y))
-    return np.diff(np.diff(corner, axis=0), axis=1)
-
-
 def environment(
     source: str | os.PathLike[str] | npt.NDArray[Any] | Environment,
     *,
     rotate: float = 0.0,
     exposure: float = 0.0,
-    nonfinite: Literal["refuse", "zero"] = "refuse",
+    bad_pixels: str = "refuse",
+    layout: str | None = None,
+    layer: str | None = None,
+    fill: str | None = None,
+    nonfinite: str | None = None,
+    device: Device | str | None = None,
 ) -> Environment:
-    """Read an environment from an image file, a folder of six faces, an array or another environment.
+    """Read an environment from an image file, six files, an array or another environment.
 
     source: an image in one of `LAYOUTS` (a 1 × 1 image is a constant); a .ktx, .ktx2, .dds, .env, .gltf or .glb file,
-      of which level 0 is taken, a cube or such an image; a folder with six square images named px nx py ny pz nz, posx
-      negx … or right left top bottom front back (front is +Z); an array (h, w) or (h, w, 1 | 3 | 4) of such an image,
-      or (6, n, n) or (6, n, n, 1 | 3 | 4), of floats (linear Rec.709) or uint8 or uint16 (sRGB).
+      of which level 0 is taken, a cube or such an image; six square images whose names end with px nx py ny pz nz, posx
+      negx … or right left top bottom front back (front is +Z), as their folder, as a pattern, or as any one of them; an
+      array (h, w) or (h, w, 1 | 3 | 4) of such an image, or (6, n, n) or (6, n, n, 1 | 3 | 4), of floats (linear
+      Rec.709) or uint8 or uint16 (sRGB); or the word `demo`, the built-in sky.
     rotate: degrees about +Y that increase the azimuth atan2(z, x) of everything. Pixels are not resampled.
     exposure: EV in [-64, 64]. Radiance is multiplied by 2^exposure.
-    nonfinite: "refuse" NaN, infinite and negative values, or make them "zero" and say so in `notices`.
+    bad_pixels: "refuse" NaN, infinite and negative values; make them "zero"; or "clamp": +inf becomes the largest value
+      of the source's pixel type, the others 0. Negative values of up to 2e-5 of the energy become 0 in any case.
+      `notices` says what was done. nonfinite: its older name.
+    layout: "latlong", "horizontal-cross", "vertical-cross", "cross" (either), "horizontal-strip" or "row",
+      "vertical-strip" or "column", "strip" (either), "openexr-cube", or "faces" (six files), in place of what the file
+      states and of what its size says.
+    layer: name of the part or layer of an OpenEXR file; by default the first part with R, G and B.
+    fill: "black" for the pixels of the display window that the data window of a file has not.
+    device: where `demo` is made.
 
-    Raises `UsageError` for an option out of its domain, `FileError` for what cannot be read, and `InputError` for what
-    was read and is not an environment.
+    Raises `UsageError` for an option out of its domain, `FileError` for what cannot be read, `InputError` for what
+    was read and is not an environment, and for `demo` `DeviceError`.
     """
-    check_options(rotate, exposure, nonfinite)
-    turn = math.radians(math.remainder(rotate, 360.0))
-    zero = nonfinite == "zero"
+    mode = check_bad_pixels(bad_pixels, nonfinite)
+    return read_environment(source, Reading(rotate, exposure, mode, layout, layer, fill), device=device)
 
+
+def read_environment(
+    source: str | os.PathLike[str] | npt.NDArray[Any] | Environment,
+    reading: Reading,
+    *,
+    device: Device | str | None = None,
+) -> Environment:
+    """Read an environment with the options of `environment`, and raise what it raises."""
+    reading.check()
+    turn = math.radians(math.remainder(reading.rotate, 360.0))
+    exposure = reading.exposure
+    if is_demo(source):
+        from whitefurnace.opencl.device import choose_device
+
+        source = demo(choose_device(device) if device is None or isinstance(device, str) else device)
+    if reading.layer is not None and not isinstance(source, (str, os.PathLike)):
+        raise UsageError(f"layer {reading.layer!r} is of an OpenEXR file, and the source is none")
     if isinstance(source, Environment):
+        if reading.layout is not None:
+            raise UsageError(f"layout {reading.layout!r} is of a file or an array, an Environment has its own")
         if turn == 0 and exposure == 0:
             return source
         found = replace(
@@ -174,12 +209,13 @@ def environment(
         )
     elif isinstance(source, (str, os.PathLike)):
         path = Path(source)
-        before = _stamps(path)
-        found = _from_folder(path, zero) if os.path.isdir(path) else _from_image(path, zero)
-        _check_unchanged(path, before, found.digest)
+        before = _stamps(path, reading.layout)
+        files = _six(path, reading.layout)
+        found = _from_image(path, reading) if files is None else _from_six(path, *files, reading)
+        _check_unchanged(path, reading.layout, before, found.digest)
         found = replace(found, rotation=turn)
     elif isinstance(source, np.ndarray):
-        found = replace(_from_array(source, zero), rotation=turn)
+        found = replace(_from_array(source, reading), rotation=turn)
     else:
         raise UsageError(
             f"an environment cannot be made from a {type(source).__name__}, "
@@ -191,58 +227,95 @@ def environment(
     return replace(found, statistics=statistics_of(found))
 
 
-def check_options(rotate: object, exposure: object, nonfinite: object) -> None:
-    """Raise `UsageError` for an option of `environment` that is out of its domain."""
-    if not _is_number(rotate):
-        raise UsageError(f"rotate is {rotate!r}, a finite angle in degrees was expected")
-    if not _is_number(exposure) or abs(exposure) > 64:  # type: ignore[arg-type]
-        raise UsageError(f"exposure is {exposure!r}, a number of EV in [-64, 64] was expected")
-    if nonfinite not in ("refuse", "zero"):
-        raise UsageError(f"nonfinite is {nonfinite!r}, 'refuse' or 'zero' was expected")
+def is_demo(source: Any) -> bool:
+    """Whether a source is the built-in environment: the word `demo`, unless there is a path of that name."""
+    return isinstance(source, (str, os.PathLike)) and str(source) == DEMO and not os.path.exists(source)
+
+
+def demo(device: Device, height: int | None = None) -> Environment:
+    """Return the built-in environment: sky, ground, and a sun of more than 1e5 times the mean radiance.
+
+    height: rows of the lat-long, 512 by default.
+    """
+    from whitefurnace.sphere.demo import HEIGHT, demo_pixels
+
+    return replace(environment(demo_pixels(device, HEIGHT if height is None else height)), name=DEMO)
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, (int, float, np.integer, np.floating)) and math.isfinite(value)
 
 
-def source_files(source: str | os.PathLike[str]) -> dict[str, Path]:
+def _six(path: Path, layout: str | None) -> tuple[list[Path], str] | None:
+    """Return the six files that a path names with the name of their set, or None for a single file.
+
+    Raises `InputError` for a folder or pattern that is to have the layout of an image.
+    """
+    if layout is None or layout == SIX_FACES:
+        return face_files(path, whole=layout == SIX_FACES)
+    if os.path.isdir(path):
+        raise InputError(f"{path} is a folder, of which --layout {layout} cannot be read; faces can")
+    return None
+
+
+def source_files(source: str | os.PathLike[str], layout: str | None = None) -> dict[str, Path]:
     """Return the files that `environment` opens for a path, by their names relative to its folder.
 
-    They are a file and what a glTF keeps beside it, or the six faces in a folder. Nothing else is read, hashed, sent or
-    listed for an environment. Raises as `environment` does for what is not one.
+    They are a file and what a glTF keeps beside it, or six faces; none for the word `demo`. Nothing else is read,
+    hashed, sent or listed for an environment. Raises as `environment` does for what is not one.
     """
+    if is_demo(source):
+        return {}
     path = Path(source)
-    return {face.name: face for face in _face_paths(path)} if os.path.isdir(path) else light_files(path)
+    files = _six(path, layout)
+    return light_files(path) if files is None else {face.name: face for face in files[0]}
 
 
-def source_digest(source: str | os.PathLike[str]) -> str:
+def source_digest(source: str | os.PathLike[str], layout: str | None = None) -> str:
     """Return the `digest` of the environment at a path, without decoding it. Raises `FileError`, `InputError`."""
     path = Path(source)
-    if os.path.isdir(path):
-        return _of_faces(digest_file(face) for face in _face_paths(path))
-    return light_digest(path)
+    files = _six(path, layout)
+    return light_digest(path) if files is None else _of_faces(digest_file(face) for face in files[0])
 
 
-def extent(source: str | os.PathLike[str]) -> tuple[str, int, int]:
+def source_name(source: str | os.PathLike[str], layout: str | None = None) -> str:
+    """Return the name of a source: a file's stem, that of a set of six files, or `demo`."""
+    if is_demo(source):
+        return DEMO
+    path = Path(os.path.abspath(source))
+    try:
+        files = _six(path, layout)
+    except (FileError, InputError):  # reading it says what is wrong
+        files = None
+    return files[1] if files is not None else path.name if path.is_dir() else path.stem
+
+
+def extent(source: str | os.PathLike[str], reading: Reading | None = None) -> tuple[str, int, int]:
     """Return the shape of an environment from its header alone: ("latlong" or "cube", rows, columns).
 
     For a cube these are the rows and columns of a face, and for a texture the sizes of level 0. Raises the errors of
     `environment` for a header.
     """
-    path = Path(source)
-    if os.path.isdir(path):
-        size = image_facts(_face_paths(path)[0]).height
+    path, how = Path(source), reading or Reading()
+    if is_demo(source):
+        from whitefurnace.sphere.demo import HEIGHT
+
+        return "latlong", HEIGHT, 2 * HEIGHT
+    files = _six(path, how.layout)
+    if files is not None:
+        size = image_facts(files[0][0], layer=how.layer, fill=how.fill, light=True).height
         return "cube", size, size
+    stated, aspect = None, 1.0
     if is_light(path):
-        pixels, cube, _ = read_radiance(path)
+        pixels, cube, *_ = read_radiance(path)
         if cube:
             return "cube", pixels.shape[1], pixels.shape[2]
         height, width = pixels.shape[:2]
     else:
-        facts = image_facts(path)
-        height, width = facts.height, facts.width
-    layout = _layout_of((height, width), str(path))
-    size = width // layout.columns
+        facts = image_facts(path, layer=how.layer, fill=how.fill, light=True)
+        height, width, stated, aspect = facts.height, facts.width, facts.layout, facts.aspect
+    layout = layout_of((height, width), str(path), [], asked=how.layout, stated=stated, aspect=aspect)
+    size = layout.size(height, width)
     return ("cube", size, size) if layout.cells else ("latlong", height, width)
 
 
@@ -253,54 +326,59 @@ def _of_faces(digests: Iterable[str]) -> str:
 _FRESH = 2_000_000_000  # ns: the coarsest times that file systems keep (FAT), and far over a kernel's tick
 
 
-def _stamps(path: Path) -> tuple[tuple[int, ...], ...] | None:
+def _stamps(path: Path, layout: str | None) -> tuple[tuple[int, ...], ...] | None:
     """Return data that change when the files of a path are written to; None where they cannot be listed."""
     try:
         return tuple(
             (s.st_dev, s.st_ino, s.st_size, s.st_mtime_ns, s.st_ctime_ns)
-            for s in (os.stat(file) for file in source_files(path).values())
+            for s in (os.stat(file) for file in source_files(path, layout).values())
         )
     except (OSError, ValueError, FileError, InputError):
         return None
 
 
-def _check_unchanged(path: Path, before: tuple[tuple[int, ...], ...] | None, digest: str) -> None:
+def _check_unchanged(path: Path, layout: str | None, before: tuple[tuple[int, ...], ...] | None, digest: str) -> None:
     """Refuse a source that was written to between the digest and the last pixel. Raises `FileError`.
 
     Otherwise the manifest would state the digest of one file for the result of another.
     """
-    after = _stamps(path)
+    after = _stamps(path, layout)
     changed = before is None or after != before
     # A second write within a tick of the clock leaves the times unchanged, so bytes are compared too.
     if not changed and max(max(s[3:]) for s in after or ((0,),)) > time.time_ns() - _FRESH:
-        changed = source_digest(path) != digest
+        changed = source_digest(path, layout) != digest
     if changed:
         raise FileError(f"{path} changed while it was read; run this again when it is whole")
 
 
-def _from_image(path: Path, zero: bool) -> Environment:
+def _from_image(path: Path, reading: Reading) -> Environment:
     if is_light(path):
-        return _from_container(path, zero)
-    image = read_image(path)
-    layout = _layout_of(image.pixels.shape, str(path))
+        return _from_container(path, reading)
+    image = read_image(path, layer=reading.layer, fill=reading.fill)
     notices = list(image.notices)
-    _clean(image.pixels[None], layout, str(path), zero, notices)
+    layout = layout_of(
+        image.pixels.shape, str(path), notices, asked=reading.layout, stated=image.layout, aspect=image.aspect
+    )
+    clean(image.pixels[None], layout, str(path), reading.bad_pixels, notices, largest=image.largest)
     return _placed(image.pixels, layout, path.stem, image.digest, notices)
 
 
-def _from_container(path: Path, zero: bool) -> Environment:
+def _from_container(path: Path, reading: Reading) -> Environment:
     """Level 0 of a cube, or a 2-D texture in one of the layouts."""
-    pixels, cube, said = read_radiance(path)
+    if reading.layer is not None:
+        raise UsageError(f"{path} is not OpenEXR and has no layer {reading.layer!r}")
+    pixels, cube, said, largest = read_radiance(path)
     notices = list(said)
-    if cube:
-        _clean(pixels, None, str(path), zero, notices)
+    if cube and reading.layout is not None:
+        raise InputError(f"{path} is a cube, --layout {reading.layout} is of an image")
+    layout = None if cube else layout_of(pixels.shape, str(path), notices, asked=reading.layout)
+    clean(pixels if cube else pixels[None], layout, str(path), reading.bad_pixels, notices, largest=largest)
+    if layout is None:
         return _cube(pixels, path.stem, "cube", light_digest(path), notices)
-    layout = _layout_of(pixels.shape, str(path))
-    _clean(pixels[None], layout, str(path), zero, notices)
     return _placed(pixels, layout, path.stem, light_digest(path), notices)
 
 
-def _from_array(array: npt.NDArray[Any], zero: bool) -> Environment:
+def _from_array(array: npt.NDArray[Any], reading: Reading) -> Environment:
     where = f"the array of shape {array.shape}"
     if array.dtype.kind != "f" and array.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{where} holds {array.dtype}, floats, uint8 or uint16 were expected")
@@ -316,21 +394,22 @@ def _from_array(array: npt.NDArray[Any], zero: bool) -> Environment:
     with np.errstate(over="ignore"):  # a double over the range of float32 is found as inf
         pixels = decode_srgb(array) if array.dtype.kind == "u" else np.array(array, np.float32, order="C")
     notices: list[str] = []
-    if cube:
-        _clean(pixels, None, where, zero, notices)
+    largest = 65504.0 if array.dtype == np.float16 else _FLOAT_MAX
+    if cube and reading.layout is not None:
+        raise UsageError(f"{where} is a cube, layout {reading.layout!r} is of an image")
+    layout = None if cube else layout_of(pixels.shape, where, notices, asked=reading.layout)
+    clean(pixels if cube else pixels[None], layout, where, reading.bad_pixels, notices, largest=largest)
+    if layout is None:
         return _cube(pixels, "array", "cube", digest.hexdigest(), notices)
-    layout = _layout_of(pixels.shape, where)
-    _clean(pixels[None], layout, where, zero, notices)
     return _placed(pixels, layout, "array", digest.hexdigest(), notices)
 
 
-def _from_folder(folder: Path, zero: bool) -> Environment:
-    paths = _face_paths(folder)
+def _from_six(source: Path, paths: list[Path], name: str, reading: Reading) -> Environment:
     images = []
     notices: list[str] = []
     size = 0
     for path in paths:
-        image = read_image(path)
+        image = read_image(path, layer=reading.layer, fill=reading.fill)
         height, width, _ = image.pixels.shape
         size = size or height
         if width != height or height != size:
@@ -339,7 +418,6 @@ def _from_folder(folder: Path, zero: bool) -> Environment:
                 + (f", here {size} x {size}" if width == height else "")
             )
         notices += image.notices
-        _clean(image.pixels[None], None, str(path), zero, notices)
         images.append(image)
     channels = 4 if any(image.pixels.shape[2] == 4 for image in images) else 3
     cube = np.ones((6, size, size, channels), np.float32)
@@ -347,83 +425,15 @@ def _from_folder(folder: Path, zero: bool) -> Environment:
         have = image.pixels.shape[2]
         face[..., : max(have, 3)] = image.pixels  # grey spreads over the three
     digest = _of_faces(image.digest for image in images)
-    return _cube(cube, folder.resolve().name, "six faces", digest, notices)
-
-
-def _face_paths(folder: Path) -> list[Path]:
-    try:
-        files = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    except OSError as error:
-        raise FileError(f"cannot read {folder}: {error.strerror or error}") from error
-    by_stem: dict[str, list[Path]] = {}
-    for path in files:
-        by_stem.setdefault(path.stem.lower(), []).append(path)
-    names = max(FACE_NAMES, key=lambda names: sum(name in by_stem for name in names))
-    missing = [name for name in names if name not in by_stem]
-    if len(missing) == 6:
-        choices = ", or ".join(" ".join(names) for names in FACE_NAMES)
-        raise InputError(f"{folder} holds no cube faces, six square images named {choices} were expected")
-    if missing:
-        raise InputError(
-            f"{folder} lacks the cube {'faces' if len(missing) > 1 else 'face'} {', '.join(missing)}, "
-            f"all of {' '.join(names)} were expected"
-        )
-    for name in names:
-        if len(by_stem[name]) > 1:
-            both = " and ".join(path.name for path in by_stem[name])
-            raise InputError(f"{folder} holds the cube face {name} more than once ({both}), one file was expected")
-    found = [by_stem[name][0] for name in names]
-    for path in found:
-        try:
-            inside(folder, path.name)
-        except ValueError:
-            raise InputError(f"{path} is a link to a file outside {folder}; copy the file there") from None
-    return found
-
-
-def _layout_of(shape: tuple[int, ...], where: str) -> Layout:
-    height, width = shape[:2]
-    if height == width == 1:
-        return LAYOUTS[0]
-    for layout in LAYOUTS:
-        if width * layout.rows == height * layout.columns:
-            return layout
-    known = ", ".join(f"{layout.name} {layout.columns}:{layout.rows}" for layout in LAYOUTS)
-    raise InputError(
-        f"{where} is {width} x {height}, an aspect ratio of {width / height:.4g} that no layout has "
-        f"({known}, or a single pixel)"
-    )
-
-
-def _cells(layout: Layout, height: int, width: int) -> Iterator[tuple[slice, slice, int]]:
-    n = width // layout.columns
-    for column, row, turns in layout.cells:
-        yield slice(row * n, (row + 1) * n), slice(column * n, (column + 1) * n), turns
-
-
-def faces_of(pixels: npt.NDArray[np.float32]) -> tuple[str, npt.NDArray[np.float32]] | None:
-    """Return the name of the layout that an image (h, w, c) has by its aspect ratio, and its texels.
-
-    The texels of a lat-long are returned unchanged; those of other layouts become faces (6, n, n, c), GL-direct.
-    Returns None where no layout has this aspect ratio.
-    """
-    try:
-        layout = _layout_of(pixels.shape, "the image")
-    except InputError:
-        return None
-    if not layout.cells:
-        return layout.name, pixels
-    height, width, _ = pixels.shape
-    return layout.name, np.stack(
-        [np.rot90(pixels[rows, columns], turns) for rows, columns, turns in _cells(layout, height, width)]
-    )
+    each = [str(path) for path in paths]
+    largest = min(image.largest for image in images)
+    clean(cube, None, str(source), reading.bad_pixels, notices, largest=largest, each=each)
+    return _cube(cube, name, "six faces", digest, notices)
 
 
 def _placed(pixels: npt.NDArray[np.float32], layout: Layout, name: str, digest: str, notices: list[str]) -> Environment:
     if layout.cells:
-        found = faces_of(pixels)
-        assert found is not None
-        return _cube(found[1], name, layout.name, digest, notices)
+        return _cube(placed(pixels, layout), name, layout.name, digest, notices)
     return _made("latlong", pixels, name, layout.name, digest, notices)
 
 
@@ -451,41 +461,6 @@ def _made(
         pixels = np.repeat(pixels, 3, axis=-1)
     texels = np.ascontiguousarray(pixels[..., :3])
     return Environment(kind, texels, coverage, 0.0, name, layout, digest, notices=tuple(notices))
-
-
-def _clean(faces: npt.NDArray[np.float32], layout: Layout | None, where: str, zero: bool, notices: list[str]) -> None:
-    """Refuse values that are NaN, inf or negative in `faces` (1 or 6, h, w, c), or make them 0 in place. What
-    no face of the layout covers does not count."""
-    if faces.min() >= 0 and faces.max() <= _FLOAT_MAX:  # false where there is a NaN
-        return
-    nonfinite, negative = ~np.isfinite(faces), faces < 0
-    negative &= ~nonfinite
-    if layout is not None and layout.cells:
-        _, height, width, _ = faces.shape
-        used = np.zeros((1, height, width, 1), bool)
-        for rows, columns, _ in _cells(layout, height, width):
-            used[:, rows, columns] = True
-        nonfinite &= used
-        negative &= used
-    for bad, what, rule, action in (
-        (nonfinite, "not finite", "radiance must be finite", "set to 0"),
-        (negative, "negative", "radiance must be at least 0", "clamped to 0"),
-    ):
-        count = int(np.count_nonzero(bad))
-        if count == 0:
-            continue
-        face, y, x, channel = (int(i) for i in np.unravel_index(int(bad.argmax()), bad.shape))
-        value = faces[face, y, x, channel]
-        if not zero:
-            place = f"pixel ({x}, {y})" + (f" of face {FACES[face]}" if len(faces) == 6 else "")
-            colour = "grey" if faces.shape[-1] == 1 else _CHANNELS[channel]
-            many = "the only value" if count == 1 else f"the first of {count} values"
-            raise InputError(
-                f"{where} holds {value} in channel {colour} of {place}, {many} that "
-                f"{'is' if count == 1 else 'are'} {what}; {rule}, or --nonfinite zero has them {action}"
-            )
-        faces[bad] = 0
-        notices.append(f"{where}: {count} {what} value{' was' if count == 1 else 's were'} {action}")
 
 
 def _expose(texels: npt.NDArray[np.float32], exposure: float, name: str) -> None:

@@ -90,7 +90,11 @@ def lut(
     normal: Sequence[float] | None = None,
     rotate: float = 0.0,
     exposure: float = 0.0,
-    nonfinite: str = "refuse",
+    bad_pixels: str = "refuse",
+    layout: str | None = None,
+    layer: str | None = None,
+    fill: str | None = None,
+    nonfinite: str | None = None,
     backfacing: str | None = None,
     precision: int = 32,
     tolerance: float | None = None,
@@ -117,7 +121,8 @@ def lut(
         SCALE alone for a default axis. One with the name of a default axis replaces it; others come after, slower.
     ndf, masking, fresnel, diffuse, brdf: models as `integrate` takes them; ggx and smith unless there is a diffuse or
         brdf.
-    light, environment, normal, rotate, exposure, nonfinite: the light of "radiance", as `integrate` takes it.
+    light, environment, normal, rotate, exposure, bad_pixels, layout, layer, fill, nonfinite: the light of "radiance",
+        as `integrate` takes it.
     backfacing: "clamp" or "absolute" accepts NoV < 0.
     precision: 32 or 64 bits. tolerance: absolute; 1e-6, or 1e-12 with 64 bits, unless the kind has its own.
     relative_tolerance: largest error as a share of each value, instead of the absolute one, or beside it as in
@@ -140,12 +145,14 @@ def lut(
     """
     models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf}
     lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
-    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "nonfinite": nonfinite, "backfacing": backfacing}
+    reading: dict[str, Any] = {"rotate": rotate, "exposure": exposure, "bad_pixels": bad_pixels, "nonfinite": nonfinite}
+    image: dict[str, Any] = {"layout": layout, "layer": layer, "fill": fill}
     accuracy: dict[str, Any] = {"precision": precision, "tolerance": tolerance, "fit": fit, "as_read": as_read}
-    accuracy["relative_tolerance"] = relative_tolerance
+    accuracy |= {"relative_tolerance": relative_tolerance, "backfacing": backfacing}
     form: dict[str, Any] = {"size": size, "axes": axes, "scheme": scheme, "stored": stored, "for_": for_}
     numbers = {**(parameters or {}), **fixed}
-    request = TableRequest(kind, path, **models, **lit, **reading, **accuracy, **form, force=force, parameters=numbers)
+    lighting = {**lit, **reading, **image}
+    request = TableRequest(kind, path, **models, **lighting, **accuracy, **form, force=force, parameters=numbers)
     return make(plan(request), device, dry_run=dry_run, progress=progress)
 
 

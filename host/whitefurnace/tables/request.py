@@ -36,7 +36,11 @@ class TableRequest:
     normal: Sequence[float] | None = None
     rotate: float = 0.0
     exposure: float = 0.0
-    nonfinite: str = "refuse"
+    bad_pixels: str = "refuse"
+    layout: str | None = None
+    layer: str | None = None
+    fill: str | None = None
+    nonfinite: str | None = None
     backfacing: str | None = None
     precision: int = 32
     tolerance: float | None = None

@@ -28,7 +28,8 @@ class Radiance(OfIntegral):
 
     def lighting(self, request: TableRequest) -> Lighting:
         from whitefurnace.catalogue.choice import chosen
-        from whitefurnace.sphere.environments import environment
+        from whitefurnace.sphere.bad_pixels import check_bad_pixels
+        from whitefurnace.sphere.environments import Reading, read_environment
         from whitefurnace.tables.cells import Lighting
 
         light, around = request.light, request.environment
@@ -41,7 +42,15 @@ class Radiance(OfIntegral):
                 )
             return Lighting({"light": chosen("light", light)})
         assert around is not None
-        env = environment(around, rotate=request.rotate, exposure=request.exposure, nonfinite=request.nonfinite)  # type: ignore[arg-type]  # a string from the command line
+        reading = Reading(
+            request.rotate,
+            request.exposure,
+            check_bad_pixels(request.bad_pixels, request.nonfinite),
+            request.layout,
+            request.layer,
+            request.fill,
+        )
+        env = read_environment(around, reading)
         up = (0.0, 1.0, 0.0) if request.normal is None else tuple(map(float, request.normal))
         return Lighting(
             {"environment": env, "normal": up},
@@ -50,7 +59,7 @@ class Radiance(OfIntegral):
                     "sha256": env.digest,
                     "rotate": round(math.degrees(env.rotation), 9),
                     "exposure": env.exposure,
-                    "nonfinite": request.nonfinite,
+                    **reading.recipe(),
                     "normal": list(up),
                 }
             },
