@@ -355,7 +355,7 @@ def test_what_cannot_be_measured_is_said(device, meter, tmp_path):
         choose(meter, 0.0, usual(ENGINES["filament"]))
     with pytest.raises(UnsupportedError, match="godot filters the image itself"):
         ErrorMeter(meter.scene, meter.env, ENGINES["godot"], device)
-    with pytest.raises(InputError, match="no materials that light falls on"):
+    with pytest.raises(InputError, match="only unlit materials"):
         sample_points(scene_of(tmp_path, {"extensions": {"KHR_materials_unlit": {}}}))
 
 

@@ -224,7 +224,7 @@ def test_only_what_changed_is_drawn_again(baked, tmp_path, device):
 
 def test_a_page_of_somebody_else_is_not_replaced(baked, tmp_path):
     (tmp_path / "index.html").write_text("<title>home</title>")
-    with pytest.raises(FileError, match="no report of whitefurnace"):
+    with pytest.raises(FileError, match="not a report of whitefurnace"):
         write_gallery(tmp_path, found_in(baked))
     assert (tmp_path / "index.html").read_text() == "<title>home</title>"
     write_gallery(tmp_path, found_in(baked), force=True)

@@ -354,7 +354,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
         (("--size", "64"), "--size is of `bench tradeoff ENV...`"),
         (("dfg", "--plot", "figures"), "--plot is of `bench tradeoff ENV...`"),
         (("--runs", "0"), "runs 0 is outside [1, 1000]"),
-        (("tradeoff",), "wants one environment"),
+        (("tradeoff",), "needs one environment"),
         (("tradeoff", "demo", "--size", "63"), "size 63 is not a power of two"),
         (("tradeoff", "demo", "--min-size", "512"), "min-size 512 is larger than size 256"),
     ],

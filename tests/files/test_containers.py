@@ -802,7 +802,7 @@ def test_lies_of_ktx1_are_found(at, value, says):
 @pytest.mark.parametrize(
     "at, value, says",
     [
-        (12, 200, ["vkFormat is 200", "no format of Vulkan"]),
+        (12, 200, ["vkFormat is 200", "not a format of Vulkan"]),
         (16, 1, ["typeSize is 1", "has 4"]),
         (20, 0, ["0 x 8", "1 to 65536"]),
         (20, 16, ["16 x 8", "square"]),

@@ -199,7 +199,7 @@ def test_a_manifest_proves_a_file_whole_or_not(tmp_path):
     data = bytearray(path.read_bytes())
     data[-1] ^= 1
     path.write_bytes(data)
-    assert contents(path).statement.whole is False and "it was changed since" in shown(path)
+    assert contents(path).statement.whole is False and "files were changed since" in shown(path)
     assert contents(tmp_path / "day_1.json").statement.whole is False
 
 

@@ -136,7 +136,7 @@ def test_a_texture_counts_with_its_mean(tmp_path):
     assert one.roughness == pytest.approx(0.4) and one.metalness == pytest.approx(0.25)
     assert one.base_color == pytest.approx((0.5,) * 3)
     assert (other.roughness, other.metalness, other.base_color, other.insulator) == (0.3, 1, GOLD, (0.04,) * 3)
-    assert found.notices == ("m0: textures vary, the sphere has the mean of what is in use",)
+    assert found.notices == ("m0: textures vary, the sphere has the mean of the parts in use",)
 
 
 def test_what_is_left_out_is_said(tmp_path):

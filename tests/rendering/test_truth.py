@@ -421,7 +421,7 @@ def test_three_panels_with_a_scale(baked):
         (["--truth", "noise.exr", "--light", "spot"], "unknown light"),
         (["--truth", "none.exr"], "none.exr"),
         (["--truth", "noise.exr", "--ndf", "ggx_anisotropic:alpha_x=.1,alpha_y=.2"], "anisotropic"),
-        (["--truth", "noise.exr", "-o", "x.jpg"], "no name of a picture"),
+        (["--truth", "noise.exr", "-o", "x.jpg"], "not the name of a picture"),
     ],
 )
 def test_what_is_refused_is_said(baked, options, said, monkeypatch):

@@ -152,6 +152,6 @@ def test_refusals(device: Device, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     # No pair of the catalogue makes energy: one is made up.
     true = energy.integrate
     monkeypatch.setattr(energy, "integrate", lambda *a, **k: replace((r := true(*a, **k)), values=r.values * 1.5))
-    with pytest.raises(UnsupportedError, match="no loss to give back"):
+    with pytest.raises(UnsupportedError, match="no energy is lost that could be restored"):
         ask("energy", tolerance=1e-3)
     assert list(tmp_path.iterdir()) == []

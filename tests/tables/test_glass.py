@@ -157,7 +157,7 @@ def test_the_statement_holds(device: Device, tmp_path: Path, ndf: str, scheme: s
 def test_refusals(device: Device, tmp_path: Path) -> None:
     ask: Any = lambda **more: lut("glass", tmp_path / "t.npy", size=4, device=device, **more)  # noqa: E731
     for error, words, more in (
-        (UnsupportedError, "each direction alone", {"masking": "kelemen"}),
+        (UnsupportedError, "one term for each direction", {"masking": "kelemen"}),
         (UnsupportedError, "isotropic", {"ndf": "ggx_anisotropic"}),
         (UnsupportedError, "dielectric", {"fresnel": "schlick:gold"}),
         (UsageError, "did you mean 'leaving'", {"scheme": "leavin"}),

@@ -266,7 +266,7 @@ class ErrorMeter:
                 "energy",
                 "model",
                 specular * self.integrals.seen + rest * self.integrals.diffuse - schlick,
-                "what it gives back of multiple scattering, and leaves for the diffuse",
+                "energy restored for multiple scattering, and left for diffuse light",
             ),
             self.entry("Fresnel", "model", schlick - self.right, "Schlick's term for the materials' indices"),
         )

@@ -425,7 +425,7 @@ class _Deciding:
                         f"glass table, n = {ior:g}, {GLASS}²",
                         "table",
                         True if free else None,
-                        f"what rough {who} reflects and lets through"
+                        f"light that rough {who} reflects and transmits"
                         if free
                         else f"{who} is rough glass; {self.engine.name} reads no such table",
                         kept=GLASS * GLASS * 8 if free else 0,
@@ -640,7 +640,7 @@ def _toml(value: Any) -> str:
     try:
         value.encode()
     except UnicodeEncodeError:
-        raise InputError(f"{value!r} is no text that a TOML file can hold") from None
+        raise InputError(f"{value!r} cannot be written in a TOML file") from None
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 

@@ -70,7 +70,7 @@ def sample_points(scene: Scene, *, least: float = 0.0, count: int = POINTS, seed
         raise UsageError(f"points {count} is outside [{POINTS_RANGE[0]}, {POINTS_RANGE[1]}]")
     there = [k for k, m in enumerate(scene.materials) if not m.unlit]
     if not there:
-        raise InputError(f"{scene.path} has no materials that light falls on: there is no error to tell of")
+        raise InputError(f"{scene.path} has only unlit materials, for which there is no error to measure")
     rng = np.random.default_rng(seed)
     uses = np.array([max(scene.materials[k].uses, 1) for k in there], np.float64)
     ends = np.cumsum(uses) / uses.sum()

@@ -318,7 +318,7 @@ def _checked(folder: Path, force: bool) -> IO[bytes]:
         if not force and os.path.lexists(path):
             with open_input(path, "a report") as file:
                 if OURS not in file.read(4096):
-                    raise FileError(f"{path} is there and is no report of whitefurnace; move it away or give --force")
+                    raise FileError(f"{path} exists and is not a report of whitefurnace; move it away or give --force")
         return tempfile.TemporaryFile(prefix="whitefurnace-")
     except OSError as error:
         raise _file_error(error, folder) from error

@@ -106,7 +106,7 @@ def _with_includes(path: Path, folder: Path, files: list[Path], within: tuple[Pa
         line = bare.count("\n", 0, found.start()) + 1
         quoted = re.fullmatch(r'"([^"]+)"', found[1].strip())
         if quoted is None:
-            raise InputError(f'{path}:{line}: #include takes a file beside this one, as #include "NAME.clh"')
+            raise InputError(f'{path}:{line}: #include takes a file in the same folder, such as #include "NAME.clh"')
         try:
             there = inside(folder, os.path.join(os.path.relpath(path.parent, folder), quoted[1]))
         except ValueError:
@@ -118,7 +118,7 @@ def _with_includes(path: Path, folder: Path, files: list[Path], within: tuple[Pa
         if len(files) > MOST_INCLUDES:
             raise InputError(f"{path}:{line}: more than {MOST_INCLUDES} files are included")
         if not there.exists():
-            raise FileError(f"{path}:{line}: {quoted[1]!r} is not found beside this file")
+            raise FileError(f"{path}:{line}: {quoted[1]!r} is not found in the folder of this file")
         body = _with_includes(there, folder, files, (*within, path))
         pieces.append(
             f'{text[end : found.start()]}#line 1 "{MARK}{there.name}"\n{body}\n#line {line} "{MARK}{path.name}"\n'

@@ -422,7 +422,7 @@ def as_read_lines(found: Sequence[Mapping[str, Any]]) -> list[str]:
     if not several:
         rows, head = [row[1:] for row in rows], head[1:]
     return [
-        f"  as read from {formats}: error of what engines show, mean over r of the RMS over directions",
+        f"  as read from {formats}: total error after the engine's sampling, mean over r of the RMS over directions",
         table([*head, *parts, "p95"], rows, left=len(head)),
     ]
 

@@ -49,7 +49,7 @@ OUTPUT, WORK = "Output", "Division of the work"
     metavar="DIR",
     type=options.FilePath,
     heading=OUTPUT,
-    help="Folder that all outputs must lie in. [default: the folder of JOB]",
+    help="Folder that must contain all outputs. [default: the folder of JOB]",
 )
 @options.option(
     "--report",

@@ -24,8 +24,8 @@ Examples:
   whitefurnace bench tradeoff studio.hdr demo --plot figures
   whitefurnace bench --dry-run
 
-Kernels are timed by the clock of the device: the median, least and largest of several runs, after one that is left out.
-`of peak` and `of memory` are fractions of the multiply-adds and of the memory reads that the device reached in the
+Kernels are timed by the clock of the device: the median, smallest and largest of several runs, after one that is left
+out. `of peak` and `of memory` are fractions of the multiply-adds and of the memory reads that the device reached in the
 same run.
 
 tradeoff bakes the specular chain of each ENV by every method and setting. It gives the seconds from texels in memory to
@@ -144,7 +144,7 @@ def _tradeoff(
     from whitefurnace.opencl.device import choose_device
 
     if not sources:
-        raise UsageError("bench tradeoff wants one environment or several: images, or the word demo")
+        raise UsageError("bench tradeoff needs one environment or several: images, or the word demo")
     tradeoff.check(size, min_size)
     if dry_run:
         for source in sources:

@@ -16,7 +16,7 @@ from whitefurnace.text import table
 if TYPE_CHECKING:
     from whitefurnace.opencl.device import Candidate
 
-EPILOG = "\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 one works, 4 none does."
+EPILOG = "\b\nExample:\n  whitefurnace devices\n\nExit codes: 0 a device works, 4 no device works."
 
 
 @options.command("Lists", "List the OpenCL devices and whether they work", EPILOG)

@@ -106,11 +106,7 @@ def _stated(statement: Mapping[str, Any] | None) -> list[str]:
     if statement["manifest"] is not None:
         lines.append(
             f"  manifest {statement['manifest']}: "
-            + (
-                "the digests match"
-                if statement["whole"]
-                else "what it lists is NOT what is there, it was changed since"
-            )
+            + ("the digests match" if statement["whole"] else "the digests do NOT match: files were changed since")
         )
     version = statement.get("whitefurnace", statement.get("version"))
     key = statement.get("key")

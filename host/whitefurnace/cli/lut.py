@@ -302,7 +302,7 @@ def _stated_lines(made: Table) -> list[str]:
         lines.append(f"  channels  {', '.join(m['channels'])}")
         lines += [f"  formula   {m['formula']}"] if "formula" in m else []
     if "stored" in m:
-        lines += [f"  stored as {m['stored']['format']}: off by {m['stored']['error']:.1e} at most, beside the error"]
+        lines += [f"  stored as {m['stored']['format']}: off by {m['stored']['error']:.1e} at most, added to the error"]
     lines += made.kind.lines(m)
     if "as_read" in m:
         read = m["as_read"]

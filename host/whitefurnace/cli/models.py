@@ -23,8 +23,7 @@ EPILOG = "\b\nExamples:\n  whitefurnace models\n  whitefurnace models ggx --json
 @click.argument("name", required=False)
 @options.as_json()
 def models(name: str | None, as_json: bool) -> None:
-    """List the models of the catalogue, or show one: its parameters with their ranges, its source, and what is known of
-    it."""
+    """List the models of the catalogue, or show one: its parameters with their ranges, its source, and known facts."""
     from whitefurnace.catalogue import SLOTS
     from whitefurnace.catalogue import models as of_slot
 

@@ -147,7 +147,7 @@ def light(help: str, *, multiple: bool = False, heading: str) -> Decorator:
         metavar="NAME[:p=v,...]",
         multiple=multiple,
         heading=heading,
-        help=f"{help}, a name from `whitefurnace models` with its parameters, as punctual:NoL=.5.",
+        help=f"{help}, a name from `whitefurnace models` with its parameters, such as punctual:NoL=.5.",
     )
 
 

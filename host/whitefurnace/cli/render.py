@@ -112,7 +112,7 @@ OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Comparison with the truth"
     "--truth",
     metavar="ENV",
     heading=TRUTH,
-    help="Draw the full reflectance integral and the difference beside the engine's picture. ENV is the "
+    help="Draw the full reflectance integral and the difference next to the engine's picture. ENV is the "
     "image that was baked. A PNG needs matplotlib. The options below need --truth.",
 )
 @options.tolerance(
@@ -150,7 +150,7 @@ OUTPUT, SPHERES, TRUTH = "Output", "Spheres", "Comparison with the truth"
     "--diffuse",
     metavar="NAME[:p=v,...]",
     heading=TRUTH,
-    help="Diffuse model, as oren_nayar:sigma=.5; see `whitefurnace models`. [default: lambert]",
+    help="Diffuse model, such as oren_nayar:sigma=.5; see `whitefurnace models`. [default: lambert]",
 )
 @options.light("Further light in addition to the environment (may be repeated)", multiple=True, heading=TRUTH)
 @options.device(TRUTH)

@@ -31,10 +31,10 @@ Examples:
   whitefurnace scene helmet.glb --for filament --environment studio.hdr --tolerance .1
   whitefurnace scene helmet.glb --pixel 0.5mm --medium rubber:skin1
 
-FILE's materials are read with their extensions and textures: the range of each value over the part of an image that
-the scene's triangles use. The list says which parts of the engine's usual bake the materials need, which they do not,
-and why; `cannot` marks what no table of an environment gives. -o bakes the parts that are needed; --job writes them as
-a job for `whitefurnace batch`.
+FILE's materials are read with their extensions and textures: the range of each value over the part of an image that the
+scene's triangles use. The list says which parts of the engine's usual bake the materials need, which they do not, and
+why; `cannot` marks effects that no table of an environment can give. -o bakes the parts that are needed; --job writes
+them as a job for `whitefurnace batch`.
 
 With --environment but without -o, or with --tolerance, the error of each approximation is measured on these materials
 in ENV against the full reflectance integral: the error of the files, of the split sum, of the model, and of the
@@ -83,7 +83,7 @@ OUTPUT, SCENE, MEDIA = "Output", "Scene and lighting", "Media inside objects"
 )
 @options.option("--background", is_flag=True, heading=SCENE, help="The environment is also visible behind the scene.")
 @options.option(
-    "--pixel", metavar="LENGTH", heading=MEDIA, help="Length on the object that one pixel covers, as 0.5mm."
+    "--pixel", metavar="LENGTH", heading=MEDIA, help="Length on the object that one pixel covers, such as 0.5mm."
 )
 @options.option(
     "--resolution",

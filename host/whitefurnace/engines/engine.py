@@ -376,7 +376,7 @@ def _check_file(engine: Engine, file: File, where: str) -> None:
         )
     if file.stored not in FORMATS[file.suffix]:
         raise UsageError(
-            f"{where}: {file.stored!r} is no format of {file.suffix}{nearest(file.stored, FORMATS[file.suffix])}"
+            f"{where}: {file.stored!r} is not a format of {file.suffix}{nearest(file.stored, FORMATS[file.suffix])}"
         )
     if file.zstd is not None and not (file.suffix == ".ktx2" and 1 <= file.zstd <= 22):
         raise UsageError(f"{where}: zstd {file.zstd} is a level from 1 to 22 of .ktx2 files")
@@ -389,7 +389,7 @@ def _check_file(engine: Engine, file: File, where: str) -> None:
     if file.suffix == ".gltf" and engine.sh != "irradiance":
         raise UsageError(f'{where}: an EXT_lights_image_based needs sh = "irradiance"')
     if file.holds == "sh" and engine.sh is None:
-        raise UsageError(f"{where}: there is no sh, one of {', '.join(SH_SCALES)}")
+        raise UsageError(f"{where}: sh is missing, one of {', '.join(SH_SCALES)}")
 
 
 def _check_layout(engine: Engine, file: File, where: str) -> None:

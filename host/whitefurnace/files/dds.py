@@ -182,7 +182,7 @@ def _newer(source: Source, at: int) -> tuple[str, str, int, bool, Literal["strai
     if dxgi not in _BY_DXGI:
         title = dxgi_name(dxgi)
         if title is None and dxgi < 116:
-            raise source.wrong(f"its dxgiFormat is {dxgi}, which is no format of a texture")
+            raise source.wrong(f"its dxgiFormat is {dxgi}, which is not a format of a texture")
         raise UnsupportedError(
             f"{source.name} has the dxgiFormat {dxgi} ({title or 'unknown'}), which is not read; {', '.join(_DXGI)} are"
         )

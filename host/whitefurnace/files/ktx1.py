@@ -172,7 +172,7 @@ def _pixel_format(source: Source, kind: int, form: int, internal: int) -> tuple[
     if not known:
         title = gl_name(internal)
         if title is None and internal < 0x100:
-            raise source.wrong(f"its glInternalFormat is {internal:#06x}, which is no format of OpenGL")
+            raise source.wrong(f"its glInternalFormat is {internal:#06x}, which is not a format of OpenGL")
         shown = f"{internal:#06x} ({title or 'of an extension'})"
         raise UnsupportedError(
             f"{source.name} has the glInternalFormat {shown}, which is not read; {', '.join(_CODES)} are"

@@ -246,7 +246,7 @@ def _pixel_format(source: Source, vk: int, dfd_at: int, dfd_bytes: int) -> tuple
         raise UnsupportedError(f"{source.name} is {shown}, which is not read; {', '.join(_KINDS)} are")
     title = vk_name(vk)
     if title is None and vk < 1_000_000_000:  # extensions number from there on
-        raise source.wrong(f"its vkFormat is {vk}, which is no format of Vulkan")
+        raise source.wrong(f"its vkFormat is {vk}, which is not a format of Vulkan")
     shown = f"{vk} ({title or 'of an extension'})"
     raise UnsupportedError(f"{source.name} has the vkFormat {shown}, which is not read; {', '.join(_KINDS)} are")
 

@@ -334,7 +334,7 @@ def read_lights(engine: Engine, folder: str | os.PathLike[str], stem: str) -> Li
     if chain is None:
         given = ", ".join(file.name.replace("{stem}", stem) for file in engine.file)
         raise UnsupportedError(
-            f"{engine.name} is given {given} and filters that itself: there is no prefiltered chain to render from"
+            f"{engine.name} is given {given} and filters it itself, so the bake has no prefiltered chain to render from"
         )
     file, path = chain
     sh: np.ndarray | None = None
@@ -382,7 +382,7 @@ def _read_everything(engine: Engine, folder: Path, stem: str) -> Lights:
             levels = tuple(held[f"specular_{k}"] for k in range(count))
             cube, table = held["irradiance"], held["dfg"]
         except KeyError as error:
-            raise InputError(f"{path} has no {error.args[0]}: it is no bake for raw") from None
+            raise InputError(f"{path} has no {error.args[0]}: it is not a bake for raw") from None
         read = [path]
     else:
         read = []
@@ -434,7 +434,7 @@ def _maps(file: File, path: Path, manifest: Path) -> tuple[tuple[np.ndarray, ...
     try:
         places = octamap.atlas_places(size, count, b)
     except ValueError:
-        raise InputError(f"{path} is no atlas of the {count} octahedral levels that {manifest} tells of") from None
+        raise InputError(f"{path} is not an atlas of the {count} octahedral levels that {manifest} states") from None
     if any(p.row + p.side + b > image.shape[0] or p.column + p.side + b > image.shape[1] for p in places):
         raise InputError(f"{path} of {image.shape[1]} x {image.shape[0]} has no room for {count} levels from {size}")
     levels = octamap.from_atlas(image, places, b)
@@ -641,7 +641,7 @@ def render(
     """
     output = Path(output)
     if output.suffix.lower() != ".png":
-        raise UsageError(f"{output} is no name of a PNG: it must end with .png")
+        raise UsageError(f"{output} is not the name of a PNG: it must end with .png")
     if not -EXPOSURES <= exposure <= EXPOSURES:
         raise UsageError(f"exposure {exposure:g} is outside [{-EXPOSURES:g}, {EXPOSURES:g}]")
     if output.exists() and not force:

@@ -544,7 +544,7 @@ def render(
 def _check(output: Path, tolerance: float, certify: int, exposure: float, force: bool) -> None:
     """Raise UsageError for numbers outside their ranges, and the errors of a picture that cannot be written."""
     if output.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"{output} is no name of a picture: it must end with {' or '.join(SUFFIXES)}")
+        raise UsageError(f"{output} is not the name of a picture: it must end with {' or '.join(SUFFIXES)}")
     low, high = TOLERANCE_RANGE
     if not low <= tolerance <= high:
         raise UsageError(f"tolerance {tolerance:g} is outside [{low:g}, {high:g}]")

@@ -209,9 +209,9 @@ def _left_out(lit: Sequence[Material]) -> list[str]:
             for m in read
             if any(b - a > EVEN for name in _TEXTURED for a, b in zip(m[name].low, m[name].high, strict=True))
         ],
-        "textures vary, the sphere has the mean of what is in use",
+        "textures vary, the sphere has the mean of the parts in use",
     )
-    add([m for m in lit if m not in read], "textures that are not read, the sphere has the middle of what they can be")
+    add([m for m in lit if m not in read], "textures that are not read, the sphere has the middle of their range")
     for what, has, instead in _KINDS:
         add([m for m in lit if has(m)], f"{what} is left out, {instead}")
     for name in sorted({name for m in lit for name in m.unread}):

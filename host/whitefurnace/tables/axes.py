@@ -314,7 +314,7 @@ def placed(
     found = {name: one for name, one in default.items() if wanted.get(name, name not in fixed)}
     for name, scale in scaled.items():
         if name not in found:
-            raise UsageError(f"axis {name}: there is no default axis of that name to scale; give A:B:N:{scale}")
+            raise UsageError(f"axis {name}: no default axis has that name; give A:B:N:{scale}")
         if scale in ("log", "f0"):
             raise UsageError(f"axis {name}: {_article(scale)} scale needs ends above 0; give A:B:N:{scale}")
         found[name] = replace(found[name], scale=scale)

@@ -113,7 +113,7 @@ def smith_check(slots: Mapping[str, Chosen]) -> None:
     """Check that the Smith term of the models depends on n·v alone. Raises UnsupportedError."""
     ndf, masking = slots["ndf"].model, slots["masking"].model
     if not ndf.isotropic:
-        raise UnsupportedError(f"smith wants an isotropic ndf; {ndf.name} is anisotropic")
+        raise UnsupportedError(f"smith needs an isotropic ndf; {ndf.name} is anisotropic")
     if masking.name != "smith":
         raise UnsupportedError(f"smith is of Smith's masking; {masking.name} is another")
 

@@ -52,7 +52,7 @@ def _albedos(what: Mapping[str, Any]) -> tuple[Integrated, Integrated]:
     if E.values.max() > 1 + 1e-6:
         raise UnsupportedError(
             f"single scattering with this masking reflects up to {E.values.max():.4g} of what "
-            "arrives: there is no loss to give back; smith has albedos of at most 1"
+            "arrives, so no energy is lost that could be restored; smith has albedos of at most 1"
         )
     return E, mean
 

@@ -59,11 +59,11 @@ def check(slots: Mapping[str, Chosen]) -> None:
     """
     ndf, masking = slots["ndf"].model, slots["masking"].model
     if not ndf.isotropic:
-        raise UnsupportedError(f"glass wants an isotropic ndf; {ndf.name} is anisotropic")
+        raise UnsupportedError(f"glass needs an isotropic ndf; {ndf.name} is anisotropic")
     if "MASKING_G1" not in masking.provides:
         raise UnsupportedError(
-            f"glass wants a masking of each direction alone, for light on either side; "
-            f"{masking.name} is none: smith and smith_separable are"
+            f"glass needs a masking that is a product of one term for each direction; "
+            f"{masking.name} is not one, smith and smith_separable are"
         )
 
 

@@ -80,7 +80,7 @@ class Kind:
     def settled(self, request: TableRequest) -> tuple[Kind, TableRequest]:
         """Return the kind and the request after the choices that the engine `for_` makes. Raises UsageError."""
         if request.for_ is not None:
-            raise UsageError(f"{self.name} is no table of engines; dfg and sheen are")
+            raise UsageError(f"{self.name} is not a table that engines load; dfg and sheen are")
         return self, request
 
     def integral(self, scheme: str | None) -> str:

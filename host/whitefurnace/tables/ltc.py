@@ -292,7 +292,7 @@ def fit_lobes(lobes: Lobes, shape: tuple[int, ...], width: np.ndarray, scheme: s
 def check(slots: Mapping[str, Chosen]) -> None:
     """Check that the NDF is isotropic. Lobes of others need a full matrix and a third axis. Raises UnsupportedError."""
     if not slots["ndf"].model.isotropic:
-        raise UnsupportedError(f"ltc wants an isotropic ndf; {slots['ndf'].model.name} is anisotropic")
+        raise UnsupportedError(f"ltc needs an isotropic ndf; {slots['ndf'].model.name} is anisotropic")
 
 
 def digests(slots: Mapping[str, Chosen]) -> tuple[str, ...]:

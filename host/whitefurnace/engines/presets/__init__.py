@@ -140,7 +140,7 @@ def engine_of_data(data: Any, where: str) -> Engine:
         engine = msgspec.convert(data, Engine)
         engine.lods, engine.bend_formula, engine.blend_formula, engine.matrix  # noqa: B018 - each raises if it is none
     except (msgspec.ValidationError, UsageError) as error:
-        raise InputError(f"{where} describes an engine that is none: {error}") from None
+        raise InputError(f"{where} describes an engine that is not valid: {error}") from None
     return engine
 
 
