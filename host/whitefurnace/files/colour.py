@@ -33,11 +33,11 @@ REFERENCE_WHITE = 203.0
 
 @dataclass(frozen=True)
 class Curve:
-    """A transfer function from encoded values to linear light, with 1 for reference white.
+    """A transfer function from encoded values to linear light, where 1 is reference white.
 
-    name     for messages
-    decode   maps float64 arrays
-    bounded  whether it is defined for encoded values from 0 to 1 only
+    name     name for messages
+    decode   function of float64 arrays
+    bounded  True if it is defined for encoded values from 0 to 1 only
     """
 
     name: str
@@ -120,13 +120,13 @@ _HLG_GAMMA, _HLG_PEAK = 1.2, 1000.0
 
 @dataclass(frozen=True)
 class Encoding:
-    """How stored values become linear Rec. 709: a curve for each channel, then a matrix.
+    """The conversion of stored values to linear Rec. 709: a curve for each channel, then a matrix.
 
-    curves     one for all colour channels, or those of R, G and B
+    curves     one curve for all colour channels, or those of R, G and B
     matrix     (3, 3) from the linear channels to Rec. 709; None for none
     luminance  weights of R, G and B in the luminance that drives HLG's OOTF; None for another encoding
-    narrow     whether integers use the narrow ("video") range of codes
-    said       names what states the encoding, such as "its cICP chunk (BT.2020, PQ)"; empty for no notice
+    narrow     True if integers use the narrow ("video") range of codes
+    said       name of the statement in the file, such as "its cICP chunk (BT.2020, PQ)"; empty for no notice
     """
 
     curves: tuple[Curve, ...]

@@ -33,11 +33,11 @@ _SPACES = {"srgb_rec709_scene": SRGB_CURVE, "sRGB": SRGB_CURVE, "lin_rec709_scen
 
 @dataclass(frozen=True)
 class Declared:
-    """What a file states.
+    """The statements of a file about its values.
 
-    encoding    how its values become radiance; None where it states none
-    associated  whether colour is multiplied by alpha
-    inverted    whether the largest code is black, which OpenImageIO leaves so
+    encoding    conversion of its values to radiance; None where it states none
+    associated  True if colour is multiplied by alpha
+    inverted    True if the largest code is black and OpenImageIO does not invert it
     """
 
     encoding: Encoding | None = None
@@ -46,9 +46,10 @@ class Declared:
 
 
 def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Declared:
-    """Return what the file at `path` states; `spec` is OpenImageIO's, `form` its name of the format.
+    """Return the statements of the file at `path`.
 
-    Raises `InputError` for what is neither read nor harmless. Adds sentences to `notices` for what is left out.
+    spec: OpenImageIO's description. form: OpenImageIO's name of the format. notices: gets sentences about statements
+    that are not applied. Raises `InputError` for a statement that is not supported and changes the values.
     """
     _check_aspect(spec, path)
     check_panorama(spec, path, notices)

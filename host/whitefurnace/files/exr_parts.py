@@ -48,12 +48,12 @@ _LONGEST = 50
 
 @dataclass(frozen=True)
 class Choice:
-    """What is read of an OpenEXR file.
+    """The part and channels of an OpenEXR file that are read.
 
     part       number of the part
-    channels   full names of the channels R, G, B and A, of R, G and B, or of one that is grey
-    layout     "latlong" or "openexr cube", as the attribute envmap says; None without it. It is of the data window.
-    aspect     width of a pixel over its height
+    channels   full names of the channels R, G, B and A, of R, G and B, or of a single grey one
+    layout     "latlong" or "openexr cube", as the attribute envmap says, of the data window; None without it
+    aspect     width of a pixel divided by its height
     primaries  CIE xy of red, green, blue and white that the file states, or None
     largest    the largest finite value that its channels can hold
     notices    sentences about what was chosen, left out and not applied
@@ -82,7 +82,7 @@ class _Layer:
 
     @property
     def label(self) -> str:
-        """What the layer is called: by its part, by the text before its channels, or by both."""
+        """Name of the layer: that of its part, the text before its channels, or both."""
         if not self.of.name or self.name == self.of.name or self.name.startswith(f"{self.of.name}."):
             return self.name
         return f"{self.of.name}.{self.name}" if self.name else self.of.name

@@ -28,12 +28,12 @@ _RGBE, _XYZE = b"32-bit_rle_rgbe", b"32-bit_rle_xyze"
 class Radiance:
     """The header of a Radiance picture.
 
-    width, height  of the upright picture
-    encoding       None where the header changes no value
-    notices        what the header states, for people
-    start          offset of the pixels; `lines` and `length` their number of scanlines and texels in each
+    width, height  pixels of the upright picture
+    encoding       conversion of its values; None where the header changes no value
+    notices        sentences about the statements of the header
+    start          offset of the pixels; `lines` and `length`: the number of scanlines, and of texels in each
     order          the resolution string, such as "-Y 64 +X 128"
-    plain          whether rows run from the top and from the left, and lines end as on Unix
+    plain          True if rows run from the top and from the left, and lines end as on Unix
     """
 
     width: int

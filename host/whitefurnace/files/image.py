@@ -113,15 +113,16 @@ def check_choice(layer: object, fill: object) -> None:
 def read_image(path: str | os.PathLike[str], *, layer: str | None = None, fill: str | None = None) -> Image:
     """Read an image as linear Rec.709 float32.
 
-    layer: name of the part or layer of an OpenEXR file; by default the first part with R, G and B. fill: "black" for
-    the pixels of the display window that the data window has not; such files are refused by default.
+    layer: name of the part or layer of an OpenEXR file; by default the first part with R, G and B. fill: "black" fills
+    the pixels of the display window that the data window does not have; such files are refused by default.
 
     Integers of 8 and 16 bits are decoded from sRGB, except a fourth channel; floats are taken as linear, unless the
     file states another encoding. Its ICC profile, code points, gamma, primaries, exposure and orientation are applied
-    and named in the notices; docs/inputs.md lists them. Extra channels are left out with a notice. Raises `FileError`
-    for a file that cannot be opened, and `InputError` for one that is not a valid image of 1, 3 or 4 channels with at
-    most 32768 x 16384 pixels and 65536 a side, or that states what is not read. Raises `UsageError` for a layer that
-    the file has not.
+    and named in the notices; docs/inputs.md lists them. Extra channels are left out with a notice.
+
+    Raises `FileError` for a file that cannot be opened; `InputError` for one that is not a valid image of 1, 3 or 4
+    channels with at most 32768 x 16384 pixels and 65536 on a side, or whose statements are not supported; and
+    `UsageError` for a layer that the file does not have.
     """
     check_choice(layer, fill)
     path = Path(path)
@@ -167,7 +168,7 @@ class Opened:
 
     @property
     def orientation(self) -> int:
-        """Exif's, 1 to 8; another number where the file states one that does not exist."""
+        """Exif's orientation, 1 to 8, or an invalid number that the file states."""
         # libjxl turns the picture itself, and Exif in JPEG XL is to be ignored [ISO/IEC 18181-2, 9.3].
         return 1 if self.form == "jpegxl" else int(self.spec.get_int_attribute("Orientation", 1))
 

@@ -27,10 +27,10 @@ _REFUSED = (
 
 
 def input_size(path: str | os.PathLike[str], what: str = "a file") -> int:
-    """Return the size in bytes of a regular file, links followed; the file is not opened.
+    """Return the size in bytes of a regular file without opening it; links are followed.
 
-    what: the kind of file that was expected, for error messages. Raises `FileError` for what is missing or is not a
-    regular file.
+    what: the kind of file that was expected, for error messages. Raises `FileError` for a file that is missing or not
+    regular.
     """
     with _refusals(path):
         return _regular(path, os.stat(path), what)

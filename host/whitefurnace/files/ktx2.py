@@ -146,9 +146,10 @@ def read_ktx2(path: str | os.PathLike[str]) -> Texture:
 
 
 def parse_ktx2(source: Source) -> Texture:
-    """Parse the bytes of a KTX 2 file. Its levels are unpacked when they are asked for.
+    """Parse the bytes of a KTX 2 file. Its levels are unpacked at their first use.
 
-    Raises `InputError` where they are not valid, and `UnsupportedError` for what is valid and not read.
+    Raises `InputError` where they are not valid, and `UnsupportedError` for a valid file of a kind that is not
+    supported.
     """
     if source.piece(0, 12, "the KTX 2 identifier") != IDENTIFIER:
         raise source.wrong("it does not begin with the identifier of KTX 2")

@@ -33,11 +33,11 @@ _OTHER_PHOTOMETRIC = {
 
 @dataclass(frozen=True)
 class Tiff:
-    """What the first image of a TIFF states.
+    """The statements of the first image of a TIFF.
 
-    encoding    None where it states none
-    associated  whether colour is multiplied by alpha
-    inverted    whether the largest code is black and OpenImageIO does not turn that round: it does for 8 bits and less
+    encoding    conversion of its values to radiance; None where it states none
+    associated  True if colour is multiplied by alpha
+    inverted    True if the largest code is black and OpenImageIO does not invert it; it does for up to 8 bits
     """
 
     encoding: Encoding | None
@@ -51,7 +51,7 @@ _WANTED = {_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _COLOR_MAP, WHITE, PRIMA
 
 
 def read_tiff(path: Path) -> Tiff:
-    """Return what the first image of a TIFF states. Raises `InputError` for what is not read."""
+    """Return the statements of the first image of a TIFF. Raises `InputError` for a kind that is not supported."""
     with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             # Of later pages only a few numbers are kept: many could state the same megabytes.

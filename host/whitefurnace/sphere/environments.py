@@ -80,10 +80,10 @@ _FLOAT_MAX = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class Reading:
-    """How a source is read; `environment` says what each option means.
+    """The options of reading a source; `environment` documents them.
 
-    bad_pixels: "refuse", "zero" or "clamp". layout: a name of `layouts.CHOICES`. fill: "black". None leaves it to the
-    file.
+    bad_pixels: "refuse", "zero" or "clamp". layout: a name of `layouts.CHOICES`. fill: "black". None leaves the choice
+    to the file.
     """
 
     rotate: float = 0.0

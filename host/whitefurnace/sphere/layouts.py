@@ -17,8 +17,11 @@ FACES = ("+X", "-X", "+Y", "-Y", "+Z", "-Z")
 
 
 class Cell(NamedTuple):
-    """Where a face lies in an image: `turns` quarter turns counter-clockwise bring it upright, after its left and right
-    have changed places where it is `mirrored`."""
+    """The place of a face in an image.
+
+    turns     quarter turns counter-clockwise that bring the face upright
+    mirrored  True if left and right are exchanged first
+    """
 
     column: int
     row: int
