@@ -9,6 +9,7 @@ import itertools
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -144,6 +145,54 @@ def test_a_job_is_checked_whole_before_anything_runs(tmp_path, shell, text, word
         assert word in shell.sentence()
     path.unlink()
     assert tree(tmp_path) == before
+
+
+EVERY_MISTAKE = {
+    "item_timeout: a time limit": 'item_timeout = "soon"',
+    "sise is not known": "sise = 3",
+    "bake[0].environments[1]: 'nope.exr'": '[[bake]]\nenvironments = ["probes/p00.exr", "nope.exr"]',
+    "bake[0].output": 'output = "../out"',
+    "bake[0].size: size 17": "size = 17",
+    "bake[0].levels: expected": 'levels = "3"',
+    "bake[0].tolerance": "tolerance = 7.0",
+    "bake[0].rotate": "rotate = inf",
+    "bake[0].exposure": "exposure = 1000",
+    "bake[0].ndf: unknown ndf 'GGX'; did you mean 'ggx'": 'ndf = "GGX"',
+    "bake[0].for: unknown engine 'Three'; did you mean 'three'": 'for = ["Three"]',
+    "bake[0].colour is not known": "colour = 3",
+    "bake[1] has no `output`": '[[bake]]\nenvironments = ["probes/p00.exr"]',
+    "bake[1].quality": 'quality = "Draught"',
+    "lut[0].kind: unknown integral 'DFG'; did you mean 'dfg'": '[[lut]]\noutput = "a.npy"\nkind = "DFG"',
+    "lut[1].output": '[[lut]]\nkind = "albedo"\noutput = "b.xyz"',
+    "lut[1].ndf": 'ndf = "ggz"',
+    "lut[1].masking": 'masking = "Smith"',
+    "lut[1].precision": "precision = 16",
+    "lut[2].ndf names evil.clh": '[[lut]]\nkind = "dfg"\noutput = "c.npy"\nndf = "evil.clh"',
+    "lut[2].size": "size = 99999",
+}
+
+
+def test_every_mistake_of_a_job_is_told_at_once(tmp_path, shell):
+    probes(tmp_path, 1)
+    path = job(tmp_path, "\n".join(EVERY_MISTAKE.values()) + "\n")
+    assert shell("batch", path, "--dry-run") == 3
+    for words in EVERY_MISTAKE:
+        assert shell.err.count(words) == 1, (words, shell.err)
+    # Nothing is told that is only a consequence: a mistake a line, in parts that semicolons separate.
+    places = [part for part in shell.err.split("; ") if re.match(r"(bake|lut)\[\d\][ .:]", part)]
+    assert len(places) == len(EVERY_MISTAKE) - 2, places
+
+
+def test_an_item_that_takes_too_long_fails_and_leaves_nothing(tmp_path, shell):
+    """Reading and baking take more than a tenth of a second, in which a process does not even build a kernel."""
+    probes(tmp_path, 1, height=256)
+    path = job(tmp_path, f'item_timeout = 0.1\n[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\n{SIZES}')
+    assert shell("batch", path) == 7
+    assert "p00.exr: it took longer than the time limit of 0.1 s (exit code 7)" in shell.err
+    assert not (tmp_path / "out").exists()
+    assert shell("batch", path, "--item-timeout", "600") == 0
+    whole(tmp_path / "out", {"p00"})
+    assert shell("batch", path, "--item-timeout", "0") == 1 and "[0.1, 1e+07]" in shell.sentence()
 
 
 def test_every_option_of_bake_and_lut_is_in_a_job():

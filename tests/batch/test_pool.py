@@ -6,6 +6,7 @@ import contextlib
 import os
 import pickle
 import queue
+import shutil
 import signal
 import subprocess
 import sys
@@ -403,6 +404,40 @@ def test_a_killed_dask_worker_costs_its_items_a_retry(cluster, tmp_path):
 
 
 @posix
+@posix
+@pytest.mark.parametrize("workers", [1, 2])
+def test_an_item_over_its_time_fails_alone(tmp_path, workers):
+    """Its worker is killed and replaced. Others that the worker had begin again, and each has one result."""
+    acts = {"endless": "hang compute", "a": "", "b": "", "c": "sleep prepare 0.3", "d": "", "e": ""}
+    jobs = [Job(name, act, str(tmp_path)) for name, act in acts.items()]
+    found = collect(jobs, workers=workers, limit=1.5)
+    endless = found.pop("endless")
+    assert (endless.state, endless.exit_code) == ("failed", CheckError.exit_code)
+    assert endless.message == "it took longer than the time limit of 1.5 s"
+    assert set(found) == set(acts) - {"endless"} and {result.state for result in found.values()} == {"done"}
+    assert all(result.pid != os.getpid() for result in found.values())
+
+
+@posix
+@pytest.mark.long
+def test_the_time_of_an_item_is_that_of_its_own_stages(tmp_path):
+    """Six items of .5 s wait for one another in one worker, longer than the limit in all."""
+    found = collect([Job(f"{k}", "sleep compute 0.5") for k in range(6)], workers=1, limit=1.4)
+    assert {result.state for result in found.values()} == {"done"}
+
+
+@pytest.mark.parametrize("limit", [0, -1, float("nan"), float("inf"), "5", True])
+def test_an_impossible_time_limit_is_told(limit):
+    with pytest.raises(UsageError, match=r"time limit of .* is not a number of seconds in \[0\.1, 1e\+07\]"):
+        pool.run(STAGES, [Job("a")], limit=limit, on_result=print)
+
+
+def test_a_time_limit_needs_processes_that_can_be_killed():
+    with pytest.raises(UsageError, match="worker processes of this machine"):
+        pool.run(STAGES, [Job("a")], limit=5, scheduler="tcp://127.0.0.1:1", on_result=print)
+
+
+@posix
 def test_workers_end_with_a_killed_parent(tmp_path):
     parent = _script(
         tmp_path,
@@ -703,6 +738,57 @@ def test_an_address_where_nobody_answers_is_told(address, error, told, monkeypat
     monkeypatch.setattr(pool, "CONNECT_SECONDS", 1)
     with pytest.raises(error, match=told):
         pool.run(STAGES, [Job("a")], scheduler=address, on_result=print)
+
+
+TLS = ("CA_FILE", "CLIENT__CERT", "CLIENT__KEY", "SCHEDULER__CERT", "SCHEDULER__KEY", "WORKER__CERT", "WORKER__KEY")
+
+
+def with_settings(files: dict[str, Path]):
+    """Dask's configuration with TLS settings, by the last parts of their names."""
+    import dask
+
+    return dask.config.set({f"distributed.comm.tls.{k.lower().replace('__', '.')}": str(v) for k, v in files.items()})
+
+
+def test_a_tls_address_without_certificates_is_told_at_once():
+    pytest.importorskip("distributed")
+    begin = time.monotonic()
+    with pytest.raises(UsageError, match="needs Dask's TLS settings") as caught:
+        pool.run(STAGES, [Job("a")], scheduler="tls://127.0.0.1:1", on_result=print)
+    assert time.monotonic() - begin < pool.CONNECT_SECONDS and "DASK_DISTRIBUTED__COMM__TLS__CA_FILE" in str(
+        caught.value
+    )
+    missing = {name.replace("CA_FILE", "ca-file"): Path("/missing/x.pem") for name in TLS[:3]}
+    with with_settings(missing), pytest.raises(FileError, match=r"/missing/x.pem"):
+        pool.run(STAGES, [Job("a")], scheduler="tls://127.0.0.1:1", on_result=print)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not shutil.which("openssl"), reason="makes its certificate with openssl")
+def test_a_cluster_with_tls(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    key, cert = tmp_path / "key.pem", tmp_path / "cert.pem"
+    subprocess.run(
+        f"openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=localhost -keyout {key} -out {cert}".split(),
+        check=True,
+        capture_output=True,
+    )
+    files = {name.replace("CA_FILE", "ca-file"): key if name.endswith("KEY") else cert for name in TLS}
+    with (
+        with_settings(files),
+        distributed.LocalCluster(
+            n_workers=1,
+            threads_per_worker=4,
+            protocol="tls",
+            host="127.0.0.1",
+            dashboard_address=":0",
+            resources={"OPENCL": 1},
+            security=distributed.Security(),
+        ) as local,
+    ):
+        assert local.scheduler_address.startswith("tls://")
+        found = collect([Job("a"), Job("b")], scheduler=local.scheduler_address)
+    assert {result.state for result in found.values()} == {"done"}
 
 
 def test_a_cluster_without_the_resource_is_waited_for_and_told():

@@ -61,8 +61,14 @@ MOST_SEEN = 2_000_000
 MOST_TABLE = 1 << 34
 """Largest size of a table in a job, in bytes. `lut` has no such limit, because its user typed the size."""
 
-MOST_REPORTED = 10
+MOST_REPORTED = 100
 """Largest number of mistakes in the error message of a job."""
+
+MISSING = "\0"
+"""Stands for a path that a job does not give, so that the rest of its table can be checked."""
+
+TIMEOUT = "item_timeout"
+"""The key of a job that limits the seconds that an item may take."""
 
 
 class Bake(msgspec.Struct, frozen=True, forbid_unknown_fields=True, rename={"for_": "for"}, omit_defaults=True):
@@ -212,6 +218,7 @@ class Job:
     named    files that recipes name: models, engines and environments of tables
     looked   folders that were searched for patterns
     folders  folders of outputs that do not exist yet, innermost first
+    item_timeout  seconds that an item may take, or None for no limit
     """
 
     path: Path
@@ -220,6 +227,7 @@ class Job:
     named: tuple[Path, ...]
     looked: tuple[Path, ...]
     folders: tuple[Path, ...]
+    item_timeout: float | None = None
 
     def shard(self, k: int, n: int) -> Job:
         """Return the job with every n-th item from the k-th on, k from 1 to n.
@@ -254,9 +262,10 @@ def job(
     data = _parsed(path)
     wrong: list[str] = []
     tables_: list[tuple[str, Bake | Lut]] = []
+    timeout = _timeout_of(data, wrong)
     for name, entries in data.items():
         if name not in TABLES:
-            wrong.append(f"{name} is not known{nearest(name, TABLES)}")
+            wrong.append(f"{name} is not known{nearest(name, [*TABLES, TIMEOUT])}")
         elif not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
             wrong.append(f"{name} is not a list of tables; write [[{name}]]")
         else:
@@ -267,7 +276,6 @@ def job(
             ]
     if not data and not wrong:
         wrong.append("it has no [[bake]] and no [[lut]]")
-    _raise_all(path, wrong)
     base = Path(os.path.realpath(path)).parent
     maker = _Maker(
         path,
@@ -289,12 +297,26 @@ def job(
             else:
                 maker.lut(place, table)
         except _TooMany as error:
-            raise InputError(f"{path}: {place}: {error}") from None
+            wrong.append(f"{place}: {error}")
+            break
         if len(maker.items) > MOST_ITEMS:
-            raise InputError(f"{path}: {place} makes it over {MOST_ITEMS} items; split the job")
+            wrong.append(f"{place} makes it over {MOST_ITEMS} items; split the job")
+            break
     maker.check_inputs()
     _raise_all(path, wrong)
-    return maker.job()
+    return replace(maker.job(), item_timeout=timeout)
+
+
+def _timeout_of(data: dict[str, Any], wrong: list[str]) -> float | None:
+    """Take the time limit of items out of a job; on a mistake, add it to `wrong` and return None."""
+    for key in (TIMEOUT, TIMEOUT.replace("_", "-")):
+        if key in data:
+            value = data.pop(key)
+            try:
+                return pool.checked_limit(value)
+            except UsageError as error:
+                wrong.append(f"{key}: {error}")
+    return None
 
 
 def shard_of(text: str) -> tuple[int, int]:
@@ -320,25 +342,33 @@ def _raise_all(path: Path, wrong: Sequence[str]) -> None:
 
 
 def _converted(kind: type[Bake] | type[Lut], entry: dict[str, Any], place: str, wrong: list[str]) -> Bake | Lut | None:
-    """Convert a table of the job file to its type; on a mistake, add it to `wrong` and return None."""
-    known = [name.rstrip("_") for name in kind.__struct_fields__]
+    """Convert a table of the job file to its type, and add every mistake to `wrong`.
+
+    A value of a wrong type counts as not given, and `MISSING` takes the place of one that is required.
+    """
+    fields = {field.name.rstrip("_"): field for field in msgspec.structs.fields(kind)}
     given: dict[str, Any] = {}
+    seen: set[str] = set()
     for key, value in entry.items():
         name = key.replace("-", "_")
-        if name not in known:
-            wrong.append(f"{place}.{key} is not known{nearest(name, known)}")
-        elif name in given:
+        if name not in fields:
+            wrong.append(f"{place}.{key} is not known{nearest(name, fields)}")
+        elif name in seen:
             wrong.append(f"{place}.{key} is given twice, as {name} and {name.replace('_', '-')}")
         else:
-            given[name] = value
-    if len(given) < len(entry):
-        return None
-    try:
-        return msgspec.convert(given, kind)
-    except msgspec.ValidationError as error:
-        text, _, where = str(error).partition(" - at `$")
-        wrong.append(f"{place}{where.rstrip('`')}: {text[0].lower()}{text[1:]}")
-        return None
+            seen.add(name)
+            try:
+                given[fields[name].name] = msgspec.convert(value, fields[name].type)
+            except msgspec.ValidationError as error:
+                text, _, where = str(error).partition(" - at `$")
+                wrong.append(f"{place}.{key}{where.rstrip('`')}: {text[0].lower()}{text[1:]}")
+    for name, field in fields.items():
+        if field.required and name not in given:
+            wrong += [] if name in seen else [f"{place} has no `{name}`"]
+            if name == "kind":  # without it nothing else means anything
+                return None
+            given[name] = MISSING if field.type is str else [MISSING]
+    return kind(**given)
 
 
 class _Maker:
@@ -392,7 +422,7 @@ class _Maker:
         report: whether a mistake is added to `wrong`.
         """
         if not output or "\0" in output:
-            self.wrong += [f"{place}.output is empty"] if report else []
+            self.wrong += [f"{place}.output is empty"] if report and output != MISSING else []
             return None
         # Both paths must be below the root: `..` after a link is the parent of the link's target.
         plain, real = os.path.normpath(self.root / output), os.path.realpath(self.root / output)
@@ -405,51 +435,72 @@ class _Maker:
             )
         return None
 
-    def _models(self, place: str, table: Bake | Lut) -> tuple[dict[str, str], bool]:
-        """Return the options that name kernel files, with absolute paths, and whether kernels are allowed."""
-        found = {}
+    def _models(self, place: str, table: Bake | Lut) -> tuple[dict[str, str], set[str]]:
+        """Return the options that name kernel files, with absolute paths, and those that may not."""
+        found, refused = {}, set()
         for option in MODELS:
             spec = getattr(table, option, None)
             file = file_of(spec) if spec else None
-            if spec and file:
-                if not self.allow_kernels:
-                    self.wrong.append(
-                        f"{place}.{option} names {file}, whose text a device would run: give "
-                        "--allow-kernels where you trust it"
-                    )
-                    return {}, False
+            if spec and file and not self.allow_kernels:
+                refused.add(option)
+                self.wrong.append(
+                    f"{place}.{option} names {file}, whose text a device would run: give "
+                    "--allow-kernels where you trust it"
+                )
+            elif spec and file:
                 found[option] = f"{self.base / file}{spec[len(file) :]}"
-        return found, True
+        return found, refused
+
+    def _planned(
+        self, place: str, options: dict[str, Any], plan: Callable[[dict[str, Any]], Planned]
+    ) -> Planned | None:
+        """Plan a recipe and return the plan; None where it has mistakes, which are all told.
+
+        Planning ends at its first mistake. Its cause is the option without which another mistake or none is found. That
+        is left out, with those whose meaning depends on it, and the rest is planned again.
+        """
+        left = dict(options)
+        while True:
+            found = _attempt(plan, left)
+            if not isinstance(found, WhitefurnaceError):
+                return found if left == options else None
+            cause = _cause(plan, left, found)
+            if cause is not None or left == options:  # else it may come from what was left out
+                self.say(f"{place}.{cause.rstrip('_')}" if cause else place, found)
+            if cause is None:
+                return None
+            for name in (cause, *DEPENDENT.get(cause, ())):
+                left.pop(name, None)
 
     def bake(self, place: str, table: Bake) -> None:
         """Add an item for each environment of a `[[bake]]`."""
         output = self._output(place, table.output, report=True)
-        models, allowed = self._models(place, table)
+        models, refused = self._models(place, table)
         files = [str(self.base / name) if name.lower().endswith(".toml") else name for name in table.for_ or ()]
         for name in files:
             if "," in name:
                 self.wrong.append(f"{place}.for: {name!r} has a comma; it is a list")
-                return
+                refused.add("for_")
         if table.for_ is not None and not table.for_:
             self.wrong.append(f"{place}.for is empty")
-            return
-        if output is None or not allowed:
-            return
         options = {
             name: value
             for name in table.__struct_fields__
-            if name not in ("environments", "output") and (value := getattr(table, name)) is not None
+            if name not in ("environments", "output", *refused) and (value := getattr(table, name)) is not None
         }
         options |= models
-        options["for_"] = ",".join(files or ["raw"])
-        try:
-            recipe = self._recipe(options)
-            order = _bake_plan(recipe, str(output), self.force)
-        except WhitefurnaceError as error:
-            self.say(place, error)
-            return
+        if "for_" not in refused:
+            options["for_"] = ",".join(files or ["raw"])
+
+        def plan(some: dict[str, Any]) -> tuple[str, baking.BakePlan]:
+            recipe = self._recipe(some)
+            return recipe, _bake_plan(recipe, str(output or self.root), self.force)
+
+        planned = self._planned(place, options, plan)
         sources: dict[str, None] = {}
         for k, pattern in enumerate(table.environments):
+            if pattern == MISSING:
+                continue
             try:
                 found = self._environments(pattern)
             except _TooMany:
@@ -460,6 +511,9 @@ class _Maker:
             sources |= dict.fromkeys(found)
         if not table.environments:
             self.wrong.append(f"{place}.environments is empty")
+        if planned is None or output is None:
+            return
+        recipe, order = planned
         # Every file name contains the stem, so the files of one item give the files of each.
         relative = [os.path.relpath(t.path, output) for t in baking.targets_of(order, _STEM)] + [f"{_STEM}.json"]
         for one in relative:
@@ -510,31 +564,36 @@ class _Maker:
     def lut(self, place: str, table: Lut) -> None:
         """Add the item of a `[[lut]]`."""
         output = self._output(place, table.output, report=True)
-        models, allowed = self._models(place, table)
-        if output is None or not allowed:
-            return
+        models, refused = self._models(place, table)
         options = {
             name: value
             for name in table.__struct_fields__
-            if name not in ("kind", "output") and (value := getattr(table, name)) not in (None, [])
+            if name not in ("output", *refused) and (value := getattr(table, name)) not in (None, [])
         }
+        options |= {"output": str(output)} if output is not None else {}
         options |= models
         if table.for_ is not None and table.for_.lower().endswith(".toml"):
             options["for_"] = str(self.base / table.for_)
         if table.environment is not None and not (table.environment == DEMO and not (self.base / DEMO).exists()):
             options["environment"] = str(self.base / table.environment)
-        recipe = _encoded(options, {})
-        try:
-            recipe = self._recipe(options)
-            request = _table_plan(recipe, table.kind, str(output), self.force)
+
+        def plan(some: dict[str, Any]) -> str:
+            some = dict(some)
+            kind, file = some.pop("kind", "dfg"), some.pop("output", str(self.root / "table.npy"))
+            recipe = _encoded(some, {})
+            try:
+                recipe = self._recipe(some)
+                request = _table_plan(recipe, kind, file, self.force)
+            except (FileError, InputError):
+                if "environment" not in some:
+                    raise
+                return recipe  # an environment that cannot be read fails this item alone, when it runs
             if request.nbytes > MOST_TABLE:
                 raise UsageError(f"a table of {request.nbytes} bytes; a job's have at most {MOST_TABLE}")
-        except (FileError, InputError) as error:
-            if table.environment is None:
-                self.say(place, error)
-                return  # an environment that cannot be read fails this item alone, when it runs
-        except WhitefurnaceError as error:
-            self.say(place, error)
+            return recipe
+
+        recipe = self._planned(place, options, plan)
+        if recipe is None or output is None:
             return
         where = f"{place}: {table.output}"
         self._into(output.parent)
@@ -590,6 +649,44 @@ def _fixed(pattern: str) -> str:
     parts = pattern.split("/")[:-1]
     first = next((k for k, part in enumerate(parts) if re.search(r"[*?\[]", part)), len(parts))
     return "/".join(parts[:first]) or "."
+
+
+DEPENDENT = {
+    "size": ("min_size", "levels", "only_levels", "axis"),
+    "min_size": ("size", "levels", "only_levels"),
+    "levels": ("size", "min_size", "only_levels"),
+    "tolerance": ("quality",),
+    "quality": ("tolerance",),
+    "axis": ("size", "set"),
+    "set": ("axis",),
+    "scheme": ("axis", "set", "size", "format"),
+    "for_": ("sh", "without", "table", "only_levels", "fit", "as_read", "scheme", "format"),
+    "kind": tuple(Lut.__struct_fields__),
+    **dict.fromkeys(MODELS, ("axis", "set")),
+}
+"""For an option that is left out, the others whose meaning depends on it."""
+
+Planned = TypeVar("Planned")
+
+
+def _attempt(plan: Callable[[dict[str, Any]], Planned], options: dict[str, Any]) -> Planned | WhitefurnaceError:
+    """Return what `plan` returns, or the error that it raises."""
+    try:
+        return plan(options)
+    except WhitefurnaceError as error:
+        return error
+
+
+def _cause(plan: Callable[[dict[str, Any]], Any], options: dict[str, Any], error: WhitefurnaceError) -> str | None:
+    """Return the option that causes an error of `plan`: without it there is another one or none. None if all do."""
+    text = str(error)
+    # Options that the message speaks of come first: without another one something different may be missing.
+    likely = sorted(options, key=lambda name: not (name.rstrip("_") in text or str(options[name]) in text))
+    for name in likely:
+        found = _attempt(plan, {other: value for other, value in options.items() if other != name})
+        if not isinstance(found, WhitefurnaceError) or str(found) != text:
+            return name
+    return None
 
 
 class _TooMany(InputError):
@@ -1040,6 +1137,7 @@ def run(
     *,
     workers: int = 1,
     scheduler: str | None = None,
+    item_timeout: float | None = None,
     on_result: Callable[[Result], None],
     on_notice: Callable[[str], None] | None = None,
 ) -> None:
@@ -1051,10 +1149,19 @@ def run(
     Raises the errors of `pool.run`.
     """
     items: Iterable[Item] = job.items
-    if scheduler is None and workers > 1:
+    limit = item_timeout if item_timeout is not None else job.item_timeout
+    if scheduler is None and (workers > 1 or limit is not None):
         items = _on_one_device(job.items)
     try:
-        pool.run(STAGES, items, workers=workers, scheduler=scheduler, on_result=on_result, on_notice=on_notice)
+        pool.run(
+            STAGES,
+            items,
+            workers=workers,
+            scheduler=scheduler,
+            limit=limit,
+            on_result=on_result,
+            on_notice=on_notice,
+        )
     finally:
         clean(job)
 

@@ -25,7 +25,15 @@ from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import Any
 
-from whitefurnace.errors import DeviceError, FileError, UnsupportedError, UsageError, WhitefurnaceError, code_of
+from whitefurnace.errors import (
+    CheckError,
+    DeviceError,
+    FileError,
+    UnsupportedError,
+    UsageError,
+    WhitefurnaceError,
+    code_of,
+)
 from whitefurnace.opencl.device import core_limit, cores
 from whitefurnace.version import VERSION
 
@@ -43,6 +51,7 @@ FIRST = 8
 FIRST_SECONDS = 30.0
 CONNECT_SECONDS = 10  # time for a scheduler to answer
 TICK = 0.1  # seconds between two checks for events that send no message: Ctrl-C, a lost scheduler
+LIMITS = (0.1, 1e7)  # of the seconds that an item may take
 ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 PATIENCE = 3.0  # seconds that a stage may take to end after the second Ctrl-C, before its process is killed
 
@@ -76,6 +85,7 @@ def run(
     *,
     workers: int = 1,
     scheduler: str | None = None,
+    limit: float | None = None,
     on_result: Callable[[Any], None],
     on_notice: Callable[[str], None] | None = None,
     stop: threading.Event | None = None,
@@ -84,8 +94,10 @@ def run(
 
     items: taken one by one as there is room, so it may be endless. workers: 1 runs in this process, more in as many
     processes with equal shares of the cores. scheduler: address of a Dask scheduler, whose workers with the resource
-    OPENCL run the items. on_result is called with each result, in order of completion, in this thread; on_notice with
-    sentences about the run. stop: an event that ends the run as Ctrl-C does.
+    OPENCL run the items. limit: seconds that an item may take in its stages; the worker of one that takes longer is
+    killed and replaced, and the item fails. With a limit even one worker is a process of its own, because nothing else
+    ends a call of a driver. on_result is called with each result, in order of completion, in this thread; on_notice
+    with sentences about the run. stop: an event that ends the run as Ctrl-C does.
     The first Ctrl-C finishes the items in flight, a second one abandons them; both raise KeyboardInterrupt at the end.
     Raises UsageError for invalid arguments, UnsupportedError without Dask or with another version of this package on a
     worker, FileError where no scheduler answers or it is lost, and DeviceError where worker processes cannot start.
@@ -95,16 +107,28 @@ def run(
         raise UsageError(f"the number of workers is {workers}, outside [1, {MOST_WORKERS}]")
     if scheduler is not None and workers != 1:
         raise UsageError("give a number of workers or a scheduler, not both: a cluster has its own workers")
+    if limit is not None:
+        checked_limit(limit)
+        if scheduler is not None:
+            raise UsageError("a time limit of items needs worker processes of this machine: give workers, no scheduler")
     report = on_notice or (lambda text: None)
     with _Interrupts(stop or threading.Event(), report) as interrupts:
         if scheduler is not None:
             _on_cluster(stages, items, scheduler, on_result, report, interrupts)
-        elif workers > 1:
-            _Crew(stages, items, workers, on_result, report, interrupts).run()
+        elif workers > 1 or limit is not None:
+            _Crew(stages, items, workers, limit, on_result, report, interrupts).run()
         else:
             _here(stages, items, on_result, interrupts)
         if interrupts.count:
             raise KeyboardInterrupt
+
+
+def checked_limit(seconds: Any) -> float:
+    """Return a time limit of items. Raises UsageError where it is no number of seconds in LIMITS."""
+    number = isinstance(seconds, int | float) and not isinstance(seconds, bool)
+    if not number or not LIMITS[0] <= seconds <= LIMITS[1]:
+        raise UsageError(f"a time limit of {seconds!r} is not a number of seconds in [{LIMITS[0]:g}, {LIMITS[1]:g}]")
+    return float(seconds)
 
 
 class _Interrupts:
@@ -173,12 +197,18 @@ class Pipeline:
 
     At most two items are read ahead (one of them still being read), and two follow (one being written).
     source: returns the next (ticket, item), or None at the end. emit: called with (ticket, item, result) when an item
-    ends, in any of the three threads.
+    ends, in any of the three threads. watch: called with (ticket, True) where a stage of an item begins and (ticket,
+    False) where it ends.
     """
 
     def __init__(
-        self, stages: Stages, source: Callable[[], tuple[int, Any] | None], emit: Callable[[int, Any, Any], None]
+        self,
+        stages: Stages,
+        source: Callable[[], tuple[int, Any] | None],
+        emit: Callable[[int, Any, Any], None],
+        watch: Callable[[int, bool], None] = lambda ticket, begins: None,
     ) -> None:
+        self._watch = watch
         self._stages = stages
         self._source = source
         self._emit = emit
@@ -234,12 +264,14 @@ class Pipeline:
 
     def _stage(self, stage: Callable[[Any], Any], value: Any, ticket: int, item: Any) -> bool:
         """Run a stage of an item and hold its output; return whether the item has ended."""
+        self._watch(ticket, True)
         try:
             given = stage(value)
         except Exception as error:  # it fails this item alone
             if stage is not self._stages.prepare:
                 self._undo(value)
             given = self._stages.failed(item, _message(error), code_of(error))
+        self._watch(ticket, False)
         with self._lock:
             if not isinstance(given, self._stages.result) and not self._closed.is_set():
                 self._held[ticket] = given
@@ -370,7 +402,12 @@ def _serve(stages: Stages, connection: Connection) -> None:
             send("warm", 0, "")
 
     computed = threading.Event()
-    pipeline = Pipeline(_Marked(stages, computed).stages(), source, emit)
+    pipeline = Pipeline(
+        _Marked(stages, computed).stages(),
+        source,
+        emit,
+        lambda ticket, begins: send("begins" if begins else "rests", ticket, ""),
+    )
     pipeline.run(idle)
 
 
@@ -408,9 +445,24 @@ class _Worker:
         self.process = process
         self.connection = connection
         self.items: dict[int, Any] = {}
+        self.spent: dict[int, float] = {}  # by ticket, seconds in stages that have ended
+        self.since: dict[int, float] = {}  # by ticket, when the stage began that it is in
         self.wants = False
         self.heard = False
         self.alone = False  # its item was with a worker that died, so it gets no other
+
+    def clock(self, kind: str, ticket: int) -> None:
+        """Note that a stage of an item begins or ends."""
+        if kind == "begins":
+            self.since[ticket] = time.monotonic()
+        else:
+            self.spent[ticket] = self.seconds(ticket)
+            self.since.pop(ticket, None)
+
+    def seconds(self, ticket: int) -> float:
+        """Return the time that an item has taken in its stages; not that in which it waited for them."""
+        now = time.monotonic()
+        return self.spent.get(ticket, 0.0) + now - self.since.get(ticket, now)
 
 
 class _Crew:
@@ -421,6 +473,7 @@ class _Crew:
         stages: Stages,
         items: Iterable[Any],
         count: int,
+        limit: float | None,
         on_result: Callable[[Any], None],
         report: Callable[[str], None],
         interrupts: _Interrupts,
@@ -428,11 +481,13 @@ class _Crew:
         self.stages = stages
         self.source = enumerate(items)
         self.count = count
+        self.limit = limit
         self.on_result = on_result
         self.report = report
         self.interrupts = interrupts
         self.workers: list[_Worker] = []
         self.again: deque[tuple[int, Any]] = deque()  # items whose worker died
+        self.back: deque[tuple[int, Any]] = deque()  # items whose worker was killed for another item
         self.ended = False  # whether the source has ended
         self.failure: BaseException | None = None
         self.warm = False
@@ -448,7 +503,8 @@ class _Crew:
                 stopping = self.interrupts.look()
                 if not stopping:
                     self._hand_out()
-                if not any(worker.items for worker in self.workers) and (stopping or (self.ended and not self.again)):
+                left = self.again or self.back or not self.ended
+                if not any(worker.items for worker in self.workers) and (stopping or not left):
                     break
                 self._listen()
         except BaseException:
@@ -472,6 +528,8 @@ class _Crew:
         return _Worker(number, process, ours)
 
     def _next(self) -> tuple[int, Any] | None:
+        if self.back:
+            return self.back.popleft()
         if self.ended:
             return None
         try:
@@ -519,6 +577,8 @@ class _Crew:
                 self._hear(worker)
             if dead:
                 self.workers[place] = self._bury(worker)
+            elif self.limit is not None:
+                self.workers[place] = self._end_late(worker, self.limit)
 
     def _hear(self, worker: _Worker) -> None:
         with contextlib.suppress(EOFError, OSError):  # the last message of a killed worker may be cut short
@@ -529,6 +589,8 @@ class _Crew:
                     worker.wants = True
                 elif kind == "warm":
                     self.warm = True
+                elif kind in ("begins", "rests"):
+                    worker.clock(kind, ticket)
                 else:
                     item = worker.items.pop(ticket)
                     worker.alone = False
@@ -537,6 +599,28 @@ class _Crew:
                     except Exception as error:
                         result = self.stages.failed(item, f"its result cannot be read: {_message(error)}", 2)
                     self._result(result)
+
+    def _end_late(self, worker: _Worker, limit: float) -> _Worker:
+        """Kill and replace a worker if one of its items is over the time limit, and return the worker of its place.
+
+        Its other items begin again. Killed it may be at any moment: what it leaves is swept as after any death.
+        """
+        late = [ticket for ticket in worker.items if worker.seconds(ticket) > limit]
+        if not late:
+            return worker
+        worker.process.kill()
+        worker.process.join()
+        self._hear(worker)  # some may have ended just now
+        worker.connection.close()
+        for ticket, item in worker.items.items():
+            if ticket in late:
+                reason = f"it took longer than the time limit of {limit:g} s"
+                self._result(self.stages.failed(item, reason, CheckError.exit_code))
+            elif worker.alone:
+                self.again.append((ticket, item))
+            elif not self.interrupts.stop.is_set():
+                self.back.append((ticket, item))
+        return self._start(worker.number)
 
     def _bury(self, worker: _Worker) -> _Worker:
         """Start a worker in place of a dead one. Each of its items may be the cause, and is tried once more, alone."""
@@ -695,6 +779,7 @@ def _on_cluster(
     for logger in loggers:
         logger.setLevel(logging.CRITICAL)  # a lost scheduler is reported by one sentence of ours
     try:
+        _check_tls(distributed, address)
         try:
             client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
         except (OSError, TimeoutError) as error:
@@ -716,6 +801,25 @@ def _on_cluster(
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
+
+
+def _check_tls(distributed: Any, address: str) -> None:
+    """Raise UsageError for an encrypted address without certificates, which Dask would try until its time is up."""
+    if address.partition("://")[0].lower() not in ("tls", "wss"):
+        return
+    settings = distributed.Security()
+    try:
+        given = settings.get_connection_args("client").get("ssl_context")
+    except OSError as error:  # a file that is missing, or is no certificate; it does not say which
+        files = (settings.tls_ca_file, settings.tls_client_cert, settings.tls_client_key)
+        names = ", ".join(str(file) for file in files if file)
+        raise FileError(f"a file of Dask's TLS settings cannot be read ({names}): {error}") from error
+    if given is None:
+        raise UsageError(
+            f"{address} needs Dask's TLS settings, in its configuration or as the environment variables "
+            "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, DASK_DISTRIBUTED__COMM__TLS__CLIENT__CERT and "
+            "DASK_DISTRIBUTED__COMM__TLS__CLIENT__KEY"
+        )
 
 
 class _Cluster:

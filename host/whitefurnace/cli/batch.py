@@ -30,6 +30,8 @@ and the options of `whitefurnace bake` under their names.
 
 A [[lut]] has `kind`, `output`, a file, and the options of `whitefurnace lut`, `axis` and `set` as lists.
 
+`item_timeout` at the top is the time limit of an item in seconds.
+
 Paths are relative to the folder of JOB. The whole job is checked before anything runs. Outputs that are up to date are
 skipped, whichever run made them, so a batch that was stopped continues where it was.
 
@@ -94,6 +96,14 @@ OUTPUT, WORK = "Output", "Division of the work"
     help="Run only every N-th item, beginning with the I-th, 1 to N. The N shards make the whole job.",
 )
 @options.option(
+    "--item-timeout",
+    metavar="SECONDS",
+    type=float,
+    heading=WORK,
+    help="Time limit of an item: its worker process is killed and replaced, and the item fails. "
+    "[default: `item_timeout` of JOB, else none]",
+)
+@options.option(
     "--allow-kernels",
     is_flag=True,
     heading=WORK,
@@ -114,6 +124,7 @@ def batch(
     scheduler: str | None,
     send: bool,
     shard: str | None,
+    item_timeout: float | None,
     allow_kernels: bool,
     device: str | None,
     dry_run: bool,
@@ -124,8 +135,11 @@ def batch(
     """Run many bakes and tables that a job file lists. Outputs that are up to date are skipped."""
     from whitefurnace import errors
     from whitefurnace.batch import jobs as batching
+    from whitefurnace.batch import pool
 
     part = batching.shard_of(shard) if shard is not None else None
+    if item_timeout is not None:
+        pool.checked_limit(item_timeout)
     if send and scheduler is None:
         raise errors.UsageError("--send sends sources to a --scheduler's cluster, and none is given")
     made = batching.job(job, root=root, allow_kernels=allow_kernels, force=force, device=device, send=send)
@@ -157,6 +171,7 @@ def batch(
                     made,
                     workers=workers,
                     scheduler=scheduler,
+                    item_timeout=item_timeout,
                     on_result=on_result,
                     on_notice=None if quiet else lambda text: say(f"notice: {text}"),
                 )
