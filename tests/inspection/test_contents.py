@@ -24,6 +24,7 @@ from whitefurnace import environment
 from whitefurnace.cli import main
 from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageError
 from whitefurnace.files import (
+    FolderOutput,
     Texture,
     digest_file,
     light_digest,
@@ -201,6 +202,47 @@ def test_a_manifest_proves_a_file_whole_or_not(tmp_path):
     path.write_bytes(data)
     assert contents(path).statement.whole is False and "files were changed since" in shown(path)
     assert contents(tmp_path / "day_1.json").statement.whole is False
+
+
+def test_a_file_of_an_earlier_bake_shows_the_recipe_of_that_bake(tmp_path):
+    """Two bakes into one folder for different engines: the second one's manifest keeps what the first one said."""
+    output = FolderOutput(tmp_path / "day.json")
+    (tmp_path / "raw").mkdir()
+    (tmp_path / "exr").mkdir()
+    np.save(tmp_path / "raw" / "day.npy", levels()[0])
+    write_exr(tmp_path / "exr" / "day.exr", levels()[0].reshape(48, 8, 3))
+    first = {
+        "whitefurnace": "1",
+        "name": "day",
+        "key": "1111",
+        "recipe": {"size": 8},
+        "levels": [{"size": 8, "error": 1e-4}],
+        "irradiance": {"error": 1e-5},
+        "files": {"raw/day.npy": {"sha256": digest_file(tmp_path / "raw" / "day.npy"), "bytes": 1}},
+    }
+    write_manifest(output.path, first)
+    there = output.manifest()
+    stale, kept = output.superseded(there, ["exr/day.exr"])
+    second = {
+        **first,
+        "key": "2222",
+        "recipe": {"size": 512},
+        "irradiance": {"error": 7e-2},
+        "files": {"exr/day.exr": {"sha256": digest_file(tmp_path / "exr" / "day.exr"), "bytes": 1}},
+        "kept": kept,
+        "earlier": output.earlier(there, kept),
+    }
+    write_manifest(output.path, second)
+    stated = contents(tmp_path / "raw" / "day.npy").statement
+    assert stale == [] and stated.whole and stated.stated["key"] == "1111" and stated.stated["recipe"] == {"size": 8}
+    assert stated.stated["irradiance"] == {"error": 1e-5}
+    assert "key 1111" in shown(tmp_path / "raw" / "day.npy") and "recipe size 8" in shown(tmp_path / "raw" / "day.npy")
+    assert "recipe size 512" in shown(tmp_path / "exr" / "day.exr")
+    # A third bake keeps both; a manifest of before that says nothing of an earlier bake states no recipe of another.
+    kept = output.superseded(output.manifest(), ["three/day.ktx2"])[1]
+    assert output.earlier(output.manifest(), kept).keys() == {"1111", "2222"}
+    write_manifest(output.path, {**second, "kept": {"raw/day.npy": first["files"]["raw/day.npy"]}, "earlier": {}})
+    assert contents(tmp_path / "raw" / "day.npy").statement.stated == {"engine": "raw"}
 
 
 def test_a_table_is_what_its_manifest_says(tmp_path):

@@ -391,7 +391,7 @@ def manifest_path(request: BakePlan, k: int) -> Path:
 
 
 def _output(request: BakePlan, k: int) -> FolderOutput:
-    return FolderOutput(manifest_path(request, k))
+    return FolderOutput(manifest_path(request, k), (t.path for t in targets_of(request, request.names[k])))
 
 
 def status(request: BakePlan, k: int) -> Baked:
@@ -430,7 +430,7 @@ def _up_to_date(request: BakePlan, k: int, there: dict[str, Any] | None, begin: 
         return None
     turn = math.radians(math.remainder(request.reading.rotate, 360.0))
     recipe = _canonical(request, turn, request.reading.exposure or 0.0)
-    if there.get("key") != _key(digest, recipe) or not _output(request, k).is_whole(there):
+    if there.get("key") != _key(digest, recipe) or "recipe" not in there or not _output(request, k).is_whole(there):
         return None
     written = targets_of(request, request.names[k])
     return Baked(
@@ -634,6 +634,7 @@ def _write(made: Computed) -> Baked:
             }
         manifest["files"] = digests
         stale, manifest["kept"] = loaded.output.superseded(loaded.there, digests)
+        manifest["earlier"] = loaded.output.earlier(loaded.there, manifest["kept"])
         write_manifest(loaded.output.path, manifest, into=transaction)
         transaction.commit(stale)
     seconds = [level.seconds for level, *_ in _rows_of(request, lit, made.of, "levels")]

@@ -10,7 +10,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -44,6 +44,11 @@ def is_safe(relative: Any) -> bool:
         return False
     path = PurePosixPath(relative)
     return not path.is_absolute() and ".." not in path.parts
+
+
+def leads_out(folder: Path, below: Path) -> bool:
+    """Return whether a folder below `folder` is really elsewhere, through a link."""
+    return Path(os.path.realpath(below)) != Path(os.path.realpath(folder), below.relative_to(folder))
 
 
 class Lock:
@@ -80,7 +85,8 @@ class Lock:
         """Remove the staged files that a killed holder left, except those in `keep`."""
         for name in self.left:
             staged = Transaction.staging(self.path.parent / name)
-            if is_safe(name) and staged not in keep and staged.is_file() and not staged.is_symlink():
+            outside = staged.parent != self.path.parent and leads_out(self.path.parent, staged.parent)
+            if is_safe(name) and staged not in keep and not outside and staged.is_file() and not staged.is_symlink():
                 with contextlib.suppress(OSError):
                     staged.unlink()
 
@@ -98,10 +104,13 @@ class Lock:
                 self.path.unlink()
 
 
-def acquire(path: Path, *, wait: bool = True, folder: bool = False) -> Lock | None:
+def acquire(
+    path: Path, *, wait: bool = True, folder: bool = False, own: Callable[[str], bool] | None = None
+) -> Lock | None:
     """Take the lock at `path` and return it, or None where another process holds it and `wait` is False.
 
-    wait: wait until the lock is free. folder: create the folder of the lock where it is missing.
+    wait: wait until the lock is free. folder: create the folder of the lock where it is missing. own: tells whether a
+    file name is one of the output's; other names in a lock file, which anybody may have written, are ignored.
     Raises FileError where the file cannot be created, or exists and is not a lock of this tool.
     """
     pause, waited, missing = _FIRST, False, 0
@@ -128,7 +137,8 @@ def acquire(path: Path, *, wait: bool = True, folder: bool = False) -> Lock | No
             raise FileError(f"cannot write into {path.parent}: {error.strerror or error}") from error
         try:
             if _try(handle) and _same(handle, path):
-                return Lock(path, handle, _left(path, handle), waited)
+                left = tuple(name for name in _left(path, handle) if own is None or own(name))
+                return Lock(path, handle, left, waited)
         except BaseException:
             os.close(handle)
             raise
@@ -167,7 +177,7 @@ def _left(path: Path, handle: int) -> tuple[str, ...]:
         return ()
     try:
         names = json.loads(data)["whitefurnace"]
-        return tuple(name for name in names if is_safe(name))
+        return tuple(name for name in names if is_safe(name)) if isinstance(names, list) else ()
     except (ValueError, LookupError, TypeError, RecursionError):
         # A death while it was written leaves its beginning.
         if data.startswith(_BEGIN):

@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
 from whitefurnace.errors import FileError
 from whitefurnace.files.atomic import Transaction, digest_file
-from whitefurnace.files.lock import Lock, acquire, is_safe, lock_path
+from whitefurnace.files.lock import Lock, acquire, is_safe, leads_out, lock_path
 from whitefurnace.files.manifest import read_manifest
 
 
@@ -47,12 +48,19 @@ class Output(ABC):
         self.name = path.name.removesuffix(".json")
 
     @abstractmethod
-    def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
+    def owns(self, name: str) -> bool:
+        """Return whether a file may belong to this output by its name, relative to the folder.
+
+        Manifests and locks act on such files alone: one that somebody planted must not reach other files.
+        """
+
+    @abstractmethod
+    def digests(self, manifest: Mapping[str, Any]) -> dict[str, str] | None:
         """Return the sha256 of each file that a manifest lists as complete; None where it is no manifest of this
         form.
         """
 
-    def kept(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
+    def kept(self, manifest: Mapping[str, Any]) -> dict[str, str]:
         """Return the sha256 of each file of earlier runs that a manifest still proves to be ours."""
         return {}
 
@@ -79,7 +87,11 @@ class Output(ABC):
         return all(self._has(self.folder / name, [digest]) for name, digest in (self.digests(manifest) or {}).items())
 
     def _has(self, file: Path, digests: Iterable[Any]) -> bool:
-        return file.is_file() and digest_file(file) in digests
+        return file.is_file() and not self._leads_out(file) and digest_file(file) in digests
+
+    def _leads_out(self, file: Path) -> bool:
+        """Return whether the folder of a file is a link to elsewhere."""
+        return file.parent != self.folder and leads_out(self.folder, file.parent)
 
     def _ours(self, manifests: Iterable[dict[str, Any] | None]) -> dict[str, list[Any]]:
         """Return, for each file, the digests that prove it to be ours."""
@@ -95,8 +107,13 @@ class Output(ABC):
         """Refuse to overwrite files, or a manifest, that are not ours.
 
         files: the files that will be written. there: the existing manifest, or None. force: True if the user allows it.
-        Raises FileError, which names the file.
+        Raises FileError, which names the file. A folder that is a link to elsewhere is refused in every case.
         """
+        for folder in sorted({path.parent for path in files if self._leads_out(path)}):
+            raise FileError(
+                f"{folder} is a link that leads out of {self.folder} to {os.path.realpath(folder)}; nothing is written "
+                "through it: remove the link, or give -o where that is meant"
+            )
         if force:
             return
         known = [there, self.staged()]
@@ -109,7 +126,7 @@ class Output(ABC):
 
     def lock(self) -> Lock:
         """Wait for the lock of the output and take it. Raises FileError."""
-        lock = acquire(lock_path(self.path), folder=self.makes_folder)
+        lock = acquire(lock_path(self.path), folder=self.makes_folder, own=self.owns)
         assert lock is not None
         return lock
 
@@ -146,6 +163,8 @@ class Output(ABC):
         renames = []
         for name, digest in digests.items():
             target = self.folder / name
+            if self._leads_out(target):
+                return None
             staged = Transaction.staging(target)
             there = digest_file(target) if target.is_file() and not target.is_symlink() else None
             if there == digest:
@@ -160,7 +179,7 @@ class Output(ABC):
     def tidy(self) -> None:
         """Complete or remove what a killed run left, unless another run holds the lock. Raises FileError."""
         path = lock_path(self.path)
-        if path.exists() and (lock := acquire(path, wait=False)):
+        if path.exists() and (lock := acquire(path, wait=False, own=self.owns)):
             try:
                 self.settle(lock)
             finally:
@@ -172,8 +191,11 @@ class FileOutput(Output):
 
     writer = "this command"
 
-    def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
-        return {self.name: manifest.get("sha256")}
+    def owns(self, name: str) -> bool:
+        return name in (self.name, self.path.name)
+
+    def digests(self, manifest: Mapping[str, Any]) -> dict[str, str] | None:
+        return {self.name: manifest["sha256"]} if _is_entry(manifest) and _is_typed(manifest, _OF_TABLE) else None
 
     def check(self, files: Sequence[Path], there: dict[str, Any] | None, force: bool) -> None:
         for path in (*files, self.path):
@@ -182,26 +204,57 @@ class FileOutput(Output):
         super().check(files, there, force)
 
 
+EARLIER = ("whitefurnace", "device", "dfg", "irradiance", "recipe", "sh", "source")
+"""Parts of a manifest that describe files of earlier bakes, for other engines, too."""
+
+
 class FolderOutput(Output):
     """The output of a bake: `ENGINE/STEM…` for several engines, and one manifest STEM.json that lists the files.
 
-    In the manifest, `files` lists what its bake wrote, and `kept` what earlier bakes wrote for other engines.
+    In the manifest, `files` lists what its bake wrote, and `kept` what earlier bakes wrote for other engines. `earlier`
+    describes these bakes by their keys.
     """
 
     writer, makes_folder = "this bake", True
 
-    def digests(self, manifest: Mapping[str, Any]) -> dict[str, Any] | None:
-        for files in (manifest.get("files"), manifest.get("kept", {})):
-            if not (
-                isinstance(files, dict)
-                and all(isinstance(entry, dict) for entry in files.values())
-                and all(is_safe(name) for name in files)
-            ):
-                return None
-        return {name: entry.get("sha256") for name, entry in manifest["files"].items()}
+    def __init__(self, path: Path, written: Iterable[Path] = ()) -> None:
+        """Take the manifest's path, and the files that the bake will write, which are the output's in any case."""
+        super().__init__(path)
+        self._written = {file.relative_to(self.folder).as_posix() for file in written}
 
-    def kept(self, manifest: Mapping[str, Any]) -> dict[str, Any]:
-        return {name: entry.get("sha256") for name, entry in manifest.get("kept", {}).items()}
+    def owns(self, name: str) -> bool:
+        """Return whether a file may belong to this output by its name.
+
+        That is its manifest and probes, and ENGINE/STEM with an ending that no letter or digit begins: `raw/day2.npz`
+        belongs to `day2` and not to `day`. Where outputs `day` and `day_1` are there, `raw/day_1.npz` belongs to the
+        latter.
+        """
+        if name in self._written or name in (self.path.name, f"{self.name}.probe"):
+            return True
+        engine, slash, file = name.partition("/")
+        if not (slash and is_safe(name) and engine not in (".", "") and "/" not in file and file.startswith(self.name)):
+            return False
+        ending = file[len(self.name) :]
+        if not ending or ending[0].isalnum():
+            return False
+        longer = (file[:k] for k in range(len(self.name) + 1, len(file)) if not file[k].isalnum())
+        return not any(self._is_output(stem) for stem in longer)
+
+    def _is_output(self, stem: str) -> bool:
+        """Return whether an output of this name is there or being written."""
+        manifest = self.folder / f"{stem}.json"
+        return any(map(os.path.lexists, (manifest, Transaction.staging(manifest), lock_path(manifest))))
+
+    def digests(self, manifest: Mapping[str, Any]) -> dict[str, str] | None:
+        for files in (manifest.get("files"), manifest.get("kept", {})):
+            if not (isinstance(files, dict) and all(map(is_safe, files)) and all(map(_is_entry, files.values()))):
+                return None
+        if not _is_typed(manifest, _OF_BAKE) or not all(map(self.owns, manifest["files"])):
+            return None
+        return {name: entry["sha256"] for name, entry in manifest["files"].items()}
+
+    def kept(self, manifest: Mapping[str, Any]) -> dict[str, str]:
+        return {name: entry["sha256"] for name, entry in manifest.get("kept", {}).items() if self.owns(name)}
 
     def stale(self, there: dict[str, Any] | None, written: Iterable[str]) -> list[Path]:
         return self.superseded(there, written)[0]
@@ -218,13 +271,24 @@ class FolderOutput(Output):
         kept: dict[str, Any] = {}
         for name, entry in {**there.get("kept", {}), **there["files"]}.items() if there else ():
             file = self.folder / name
-            if name in new or not self._has(file, [entry.get("sha256")]):
+            if name in new or not self.owns(name) or not self._has(file, [entry.get("sha256")]):
                 continue
             if name.split("/")[0] in engines:
                 stale.append(file)
             else:
-                kept[name] = entry
+                # The bake that wrote the file is told by its key: the manifest describes another one from now on.
+                key = there.get("key") if there and name in there["files"] else None
+                kept[name] = {**entry, "key": key} if isinstance(key, str) else entry
         return stale, kept
+
+    def earlier(self, there: dict[str, Any] | None, kept: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what the manifest `there` says of the bakes that wrote the files `kept`, by their keys."""
+        if not there:
+            return {}
+        known = dict(there.get("earlier", {}))
+        if isinstance(there.get("key"), str):
+            known[there["key"]] = {name: there[name] for name in EARLIER if name in there}
+        return {key: known[key] for key in sorted({entry.get("key", "") for entry in kept.values()}) if key in known}
 
     def check_writable(self, folders: Iterable[Path]) -> None:
         """Create the folders and a file in each, so that a folder that cannot be written is found before the work
@@ -250,3 +314,70 @@ class FolderOutput(Output):
         folder.
         """
         return folder / f"{self.name}.probe"
+
+
+# ------------------------------------------------------------------------------------------------ forms of manifests
+
+_DIGEST = re.compile(r"[0-9a-f]{64}")
+_MOST = 1 << 62
+"""Larger numbers of bytes are not those of a file."""
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= 1e300
+
+
+def _rows(value: Any) -> bool:
+    """Return whether a value is a list of objects whose errors and sizes are numbers."""
+    return isinstance(value, list) and all(map(_row, value))
+
+
+def _row(value: Any) -> bool:
+    figures = ("error", "worst", "rmse", "size", "roughness", "energy_kept", "pairs")
+    return isinstance(value, dict) and all(value.get(name) is None or _number(value[name]) for name in figures)
+
+
+def _source(value: Any) -> bool:
+    return isinstance(value, dict) and _texts(value.get("notices", []))
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(text, str) for text in value)
+
+
+def _recipe(value: Any) -> bool:
+    only = value.get("only") if isinstance(value, dict) else 0
+    return only is None or (isinstance(only, list) and len(only) == 2 and all(type(k) is int for k in only))
+
+
+# What a run reads of a manifest that is up to date, where the manifest has it.
+_OF_TABLE: Mapping[str, Callable[[Any], bool]] = {
+    "key": lambda value: isinstance(value, str),
+    "recipe": lambda value: isinstance(value, dict),
+    "error": lambda value: value is None or _number(value),
+    "notices": _texts,
+}
+_OF_BAKE: Mapping[str, Callable[[Any], bool]] = {
+    "key": lambda value: isinstance(value, str),
+    "recipe": _recipe,
+    "source": _source,
+    "levels": _rows,
+    "as_read": _rows,
+    "irradiance": _row,
+    "earlier": lambda value: isinstance(value, dict) and all(isinstance(one, dict) for one in value.values()),
+}
+
+
+def _is_typed(manifest: Mapping[str, Any], form: Mapping[str, Callable[[Any], bool]]) -> bool:
+    """Return whether the values of a manifest have the types that a run expects, where it has them."""
+    return all(fits(manifest[name]) for name, fits in form.items() if name in manifest)
+
+
+def _is_entry(entry: Any) -> bool:
+    """Return whether the entry of a file has a sha256, and a number of bytes where it states one."""
+    if not isinstance(entry, Mapping) or not isinstance(entry.get("sha256"), str):
+        return False
+    nbytes = entry.get("bytes", 0)
+    if not isinstance(entry.get("key", ""), str):
+        return False
+    return bool(_DIGEST.fullmatch(entry["sha256"])) and type(nbytes) is int and 0 <= nbytes <= _MOST

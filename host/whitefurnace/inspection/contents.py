@@ -529,7 +529,7 @@ def _statement(path: Path) -> Statement | None:
                 own = {name: value for name, value in entry.items() if name not in ("sha256", "bytes")}
                 engine = relative.split("/")[0] if "/" in relative else None
                 # The levels in `entry` are those of this file; the others describe the whole bake.
-                bake = {name: value for name, value in _without_files(found).items() if name != "levels"}
+                bake = {name: value for name, value in _bake_of(found, relative).items() if name != "levels"}
                 return Statement(manifest, _matches(path, entry), {**bake, **own, "engine": engine})
     return None
 
@@ -550,6 +550,17 @@ def _files(manifest: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     return found
 
 
+def _bake_of(manifest: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """Return what a manifest says of the bake that wrote a file: its own, or an earlier one for another engine."""
+    files, kept, earlier = (manifest.get(part) for part in ("files", "kept", "earlier"))
+    if isinstance(files, dict) and name in files:
+        return _without_files(manifest)
+    entry = kept.get(name) if isinstance(kept, dict) else None
+    key = entry.get("key") if isinstance(entry, dict) else None
+    made = earlier.get(key) if isinstance(earlier, dict) and isinstance(key, str) else None
+    return dict(made) if isinstance(made, dict) else {}
+
+
 def _matches(path: Path, entry: Mapping[str, Any]) -> bool:
     """Return whether the file has the digest of its entry in a manifest."""
     try:
@@ -559,7 +570,7 @@ def _matches(path: Path, entry: Mapping[str, Any]) -> bool:
 
 
 def _without_files(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: value for name, value in manifest.items() if name not in ("files", "kept")}
+    return {name: value for name, value in manifest.items() if name not in ("files", "kept", "earlier")}
 
 
 def _manifest_sh(manifest: Mapping[str, Any]) -> np.ndarray | None:
