@@ -549,3 +549,13 @@ def test_openimageio_is_loaded_late_and_by_one_package():
 
 def test_errors_are_of_the_tree():
     assert issubclass(InputError, WhitefurnaceError) and InputError.exit_code == 3 and FileError.exit_code == 2
+
+
+@pytest.mark.parametrize("name", ["plain.png", "plain.tif"])
+@pytest.mark.parametrize("rows", [349, 350, 701, 1500])
+def test_an_image_that_packs_well_is_whole(tmp_path, name, rows):
+    """Rows of several MiB in one chunk, most of them of one colour: 349 and 350 rows of 1000 pixels are 1 MiB."""
+    pixels = np.full((rows, 1000, 3), 128, np.uint8)
+    pixels[:5] = np.random.default_rng(rows).integers(0, 256, (5, 1000, 3))
+    read = read_image(save(tmp_path / name, pixels, "uint8", compression="zip")).pixels
+    assert read.shape == pixels.shape and np.ptp(read[5:]) == 0

@@ -113,11 +113,19 @@ class _Rows:
         """Whether all rows and the end of the deflated data have come."""
         return not self._spans and (self._inflate.eof or self._passed > _SURPLUS)
 
+    @property
+    def _over(self) -> bool:
+        """Whether nothing that comes is looked at any more."""
+        return self._inflate.eof or (not self._spans and self._passed > _SURPLUS)
+
     def take(self, block: bytes) -> None:
         try:
-            while block and not self._inflate.eof and self._passed <= _SURPLUS:
-                self._look(self._inflate.decompress(block, 1 << 20))
-                block = self._inflate.unconsumed_tail
+            # zlib may take the last of its input and still hold output for the next call, if a piece is full.
+            full = False
+            while (block or full) and not self._over:
+                piece = self._inflate.decompress(block, 1 << 20)
+                self._look(piece)
+                block, full = self._inflate.unconsumed_tail, len(piece) == 1 << 20
         except zlib.error as error:
             raise self._wrong(f"its pixels cannot be inflated ({error})") from error
 
@@ -151,9 +159,9 @@ def _check_tiff(path: Path) -> None:
         for start, length in spans:
             inflate = zlib.decompressobj()
             try:
-                piece = data[start : start + length]
-                while piece and not inflate.eof:
-                    inflate.decompress(piece, 1 << 20)
+                piece, full = data[start : start + length], False
+                while (piece or full) and not inflate.eof:
+                    full = len(inflate.decompress(piece, 1 << 20)) == 1 << 20
                     piece = inflate.unconsumed_tail
                 if inflate.eof:
                     continue
