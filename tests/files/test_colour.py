@@ -19,6 +19,7 @@ from PIL import ImageCms, ImageOps, TiffImagePlugin
 from whitefurnace.cli import main
 from whitefurnace.errors import InputError
 from whitefurnace.files import image_facts, read_image
+from whitefurnace.inspection.contents import contents, described
 from whitefurnace.sphere.environments import environment, extent
 
 # Matrices from RGB to XYZ of the standards themselves: IEC 61966-2-1 and ITU-R BT.2087.
@@ -406,6 +407,17 @@ def test_pq_is_1_at_203_nits_and_has_its_peak(tmp_path):
     assert np.abs(image.pixels - pattern()).mean() < 2e-4  # the matrix has four digits
     white = png(tmp_path / "b.png", np.full((1, 2, 3), 65535, np.uint16), (b"cICP", bytes((9, 16, 0, 1))))
     np.testing.assert_allclose(read_image(white).pixels, 10000 / 203, rtol=1e-5)
+
+
+def test_the_limit_of_codes_is_what_the_largest_code_means(tmp_path):
+    """PQ's largest code is 10 000 cd/m²; a value over 1 is not at the limit of its format."""
+    codes = codes16(pq_encoded(np.array([203.0, 1000, 10000]))).reshape(1, 3, 1).repeat(3, axis=2)
+    path = png(tmp_path / "a.png", codes, (b"cICP", bytes((1, 16, 0, 1))))
+    assert read_image(path).largest == pytest.approx(10000 / 203, rel=1e-6)
+    (row,) = described(contents(path))["levels"]
+    assert row["at_limit"] == 3
+    (row,) = described(contents(png(tmp_path / "b.png", codes)))["levels"]
+    assert row["at_limit"] == 3 and read_image(tmp_path / "b.png").largest == 1
 
 
 def test_hlg_with_its_ootf(tmp_path):
@@ -897,6 +909,22 @@ def test_panoramas_say_what_they_are(tmp_path):
     assert "tilted" in read_image(saved(**whole, PosePitchDegrees=10)).notices[0]
     refused(saved(ProjectionType="cylindrical"), "cylindrical")
     refused(saved(FullPanoHeightPixels=16, CroppedAreaImageHeightPixels=4), "height 4 of 16")
+
+
+def test_colour_spaces_of_jpeg_2000(tmp_path):
+    path = tmp_path / "a.jp2"
+    Pillow.fromarray(RGB8).save(path, irreversible=False)
+    np.testing.assert_allclose(read_image(path).pixels[0, 0], DECODED, rtol=1e-6)
+    data = path.read_bytes()
+    at = data.index(b"colr") - 4
+    path.write_bytes(data[: at + 11] + struct.pack(">I", 14) + data[at + 15 :])
+    refused(path, "colour space 14")
+    icc = matrix_profile([curv()])
+    box = struct.pack(">I4s3B", 11 + len(icc), b"colr", 2, 0, 0) + icc
+    head = data.index(b"jp2h") - 4
+    size = int.from_bytes(data[head : head + 4], "big") - 15 + len(box)
+    path.write_bytes(data[:head] + struct.pack(">I", size) + data[head + 4 : at] + box + data[at + 15 :])
+    np.testing.assert_allclose(read_image(path).pixels[0, 0], np.array([64, 128, 192]) / 255, rtol=1e-6)
 
 
 def test_jpeg_xl_by_code_points(tmp_path):

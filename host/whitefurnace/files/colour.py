@@ -151,6 +151,11 @@ class Encoding:
         with np.errstate(all="ignore"):
             return tuple(curve.decode(encoded).astype(np.float32) for curve in self.curves)
 
+    def largest(self, dtype: npt.DTypeLike) -> float:
+        """Return the value of the largest code of every channel; infinity where a pixel's channels are mixed."""
+        mixed = self.matrix is not None or self.luminance is not None
+        return np.inf if mixed else max(float(table.max()) for table in self.tables(dtype))
+
     def check_channels(self, channels: int, path: Path) -> None:
         """Raise `InputError` where a grey image would need a curve for each of R, G and B."""
         if channels == 1 and len(self.curves) > 1 and not all(c.near(self.curves[0]) for c in self.curves[1:]):

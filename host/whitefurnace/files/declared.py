@@ -25,6 +25,7 @@ from whitefurnace.files.colour import (
 )
 from whitefurnace.files.exif import read_exif
 from whitefurnace.files.icc import MAX_BYTES, read_icc
+from whitefurnace.files.inputs import open_input
 from whitefurnace.files.tiff import read_tiff
 
 # OpenImageIO's names of colour spaces with the primaries of Rec. 709; "" and None stand for nothing stated.
@@ -158,7 +159,7 @@ _COLOUR_CHUNKS = (b"cICP", b"iCCP", b"sRGB", b"gAMA", b"cHRM", b"eXIf", b"acTL")
 def _png(path: Path, channels: int) -> Encoding | None:
     """Return the encoding of a PNG, by the order cICP, iCCP, sRGB, gAMA and cHRM [PNG 3, 4.3], then Exif."""
     found: dict[bytes, bytes] = {}
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         for kind, length in _png_chunks(file):
             if kind not in _COLOUR_CHUNKS:
                 continue
@@ -250,7 +251,7 @@ def _jpeg(path: Path, spec: Any, channels: int, notices: list[str]) -> Encoding 
     pieces: dict[int, bytes] = {}
     counts = set()
     gain_map, exif = False, b""
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         for marker, length in _jpeg_segments(file):
             if marker not in (0xE1, 0xE2):
                 continue
@@ -305,7 +306,7 @@ def _webp(path: Path, channels: int) -> Encoding | None:
     """Return the encoding of the profile in the chunk ICCP. Refuses animations."""
     found: dict[bytes, bytes] = {}
     frames = chunks = 0
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         at = 12
         while len(head := _at(file, at, 8)) == 8:
             kind, length = struct.unpack("<4sI", head)
@@ -337,7 +338,7 @@ def _at(file: BinaryIO, offset: int, length: int) -> bytes:
 
 def _bmp(path: Path, channels: int) -> Encoding | None:
     """Return the encoding of the headers of version 4 and 5 [Microsoft, BITMAPV5HEADER]."""
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         head = file.read(14 + 124)
         if len(head) < 14 + 108 or int.from_bytes(head[14:18], "little") < 108:
             return None
@@ -375,7 +376,7 @@ def _bmp(path: Path, channels: int) -> Encoding | None:
 
 
 def _check_gif(path: Path) -> None:
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         ratio = file.read(13)[-1]
     if ratio and not 0.99 < (ratio + 15) / 64 < 1.01:  # [GIF 89a, 18]
         raise InputError(
@@ -384,7 +385,7 @@ def _check_gif(path: Path) -> None:
 
 
 def _check_psd(path: Path) -> None:
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         mode = int.from_bytes(_at(file, 24, 2), "big")
     if mode not in (0, 1, 2, 3):
         name = {4: "CMYK", 7: "multichannel", 8: "duotone", 9: "Lab"}.get(mode, "unknown")
@@ -393,7 +394,7 @@ def _check_psd(path: Path) -> None:
 
 def _check_jpeg2000(path: Path) -> None:
     """Refuse an enumerated colour space other than sRGB, grey and sYCC [ISO/IEC 15444-1, I.5.3.3]."""
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         head = file.read(1 << 16)
     at = head.find(b"colr")
     if at > 0 and head[at + 4 : at + 5] == b"\1":

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from whitefurnace.errors import InputError
 from whitefurnace.files.colour import LINEAR, Curve, Encoding, from_primaries
+from whitefurnace.files.inputs import open_input
 from whitefurnace.files.memory import require
 
 _HEADER_BYTES = 1 << 20
@@ -48,7 +49,7 @@ class Radiance:
 
     def rewrite(self, path: Path, copy: Path, flat: bytes | None) -> None:
         """Write the pixels of `path`, or these flat ones, with a header in which scanlines are rows from the top."""
-        with open(path, "rb") as whole, open(copy, "wb") as out:
+        with open_input(path) as whole, open(copy, "wb") as out:
             out.write(b"#?RADIANCE\nFORMAT=%s\n\n-Y %d +X %d\n" % (_RGBE, self.lines, self.length))
             if flat is not None:
                 out.write(flat)
@@ -65,7 +66,7 @@ class Radiance:
         size, total = path.stat().st_size - self.start, self.lines * self.length
         if size == 4 * total:
             return None
-        with open(path, "rb") as file:
+        with open_input(path) as file:
             file.seek(self.start)
             if file.read(4) == bytes((2, 2, self.length >> 8 & 255, self.length & 255)) or size < 8:
                 return None
@@ -98,7 +99,7 @@ class Radiance:
 
 def read_radiance_header(path: Path) -> Radiance:
     """Read the header of a Radiance picture. Raises `InputError` for one that is malformed or of a kind not read."""
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         head = file.read(_HEADER_BYTES)
     end = re.search(rb"\r?\n\r?\n", head)
     if end is None:

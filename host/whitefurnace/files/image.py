@@ -292,7 +292,7 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
     _complaint(source)
     if choice is None and int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
         notices.append(f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read")
-    pixels = _radiance(source, spec, picks, path, pixel, declared, notices)
+    pixels, largest = _radiance(source, spec, picks, path, pixel, declared, notices)
     if found.radiance is not None:
         pixels = found.radiance.upright(pixels)
     else:
@@ -303,13 +303,16 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
         pixels = _upright(pixels, found.orientation)
     if choice is not None:
         return Image(pixels, path, digest, form, tuple(notices), choice.layout, choice.aspect, choice.largest)
-    return Image(pixels, path, digest, form, tuple(notices), largest=_HALF_MAX if pixel == "half" else _FLOAT_MAX)
+    return Image(pixels, path, digest, form, tuple(notices), largest=largest)
 
 
 def _radiance(
     source: Any, spec: Any, picks: list[int], path: Path, pixel: str, declared: Declared, notices: list[str]
-) -> npt.NDArray[np.float32]:
-    """Read the pixels and bring them to linear Rec. 709 by the encoding that the file states."""
+) -> tuple[npt.NDArray[np.float32], float]:
+    """Read the pixels and bring them to linear Rec. 709 by the encoding that the file states.
+
+    Returns the largest value that they can hold too.
+    """
     integer = pixel in ("uint8", "uint16")
     default = SRGB_CURVE if integer else LINEAR
     encoding = declared.encoding
@@ -334,12 +337,13 @@ def _radiance(
             pixels[..., :3] *= alpha
         else:
             encoding.linearize(pixels, path)
+    largest = encoding.largest(pixel) if integer else _HALF_MAX if pixel == "half" else _FLOAT_MAX
     outside = encoding.to_rec709(pixels)
     if encoding.said:
         notices.append(f"{path}: converted to linear Rec.709 from {encoding.said}")
     if outside:
         notices.append(f"{path}: {outside}")
-    return pixels
+    return pixels, min(largest, _FLOAT_MAX)
 
 
 def _check_size(spec: Any, path: Path, size: int, form: str) -> None:

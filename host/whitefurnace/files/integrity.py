@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from whitefurnace.errors import InputError
+from whitefurnace.files.inputs import open_input
 from whitefurnace.files.memory import require
 from whitefurnace.files.tiff_tags import COMPRESSION, MAGIC, directories
 
@@ -33,7 +34,7 @@ def _check_png(path: Path, size: int) -> None:
     """Verify every length and checksum, and the rows. libpng would print errors in them on stderr."""
     rows: _Rows | None = None
     palette = False
-    with open(path, "rb") as file:
+    with open_input(path) as file:
         start = 8
         while True:
             file.seek(start)
@@ -151,7 +152,7 @@ class _Rows:
 
 def _check_tiff(path: Path) -> None:
     """Inflate every deflated strip or tile, a piece at a time, to verify its Adler-32 checksum."""
-    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with open_input(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             spans = list(_tiff_streams(data))
         except (struct.error, LookupError, TypeError, ValueError, ArithmeticError):

@@ -14,6 +14,7 @@ from whitefurnace.errors import InputError
 from whitefurnace.files.colour import LINEAR, SRGB_CURVE, Curve, Encoding
 from whitefurnace.files.exif import read_exif
 from whitefurnace.files.icc import MAX_BYTES, read_icc
+from whitefurnace.files.inputs import open_input
 from whitefurnace.files.tiff_tags import PRIMARIES, WHITE, Values, chromaticities, directories
 
 _SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _COLOR_MAP = 254, 255, 258, 262, 320
@@ -52,7 +53,7 @@ _WANTED = {_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _COLOR_MAP, WHITE, PRIMA
 
 def read_tiff(path: Path) -> Tiff:
     """Return the statements of the first image of a TIFF. Raises `InputError` for a kind that is not supported."""
-    with open(path, "rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+    with open_input(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
             # Of later pages only a few numbers are kept: many could state the same megabytes.
             pages = list(directories(data, (_SUBFILE, _OLD_SUBFILE), 16))

@@ -437,6 +437,8 @@ def _of_image(path: Path, statement: Statement | None, layer: str | None, fill: 
             path, "table", container, form, (level,), keys=keys, facts=shown, largest=limit, statement=statement
         )
     image = read_image(path, layer=layer, fill=fill)
+    if facts.pixel in ("uint8", "uint16"):  # the largest code is as bright as the file says; coverage ends at 1
+        limit = (image.largest,) * min(image.pixels.shape[2], 3) + (1.0,) * (image.pixels.shape[2] == 4)
     atlas = statement is not None and statement.stated.get("layout") == "octahedral"
     found = None if atlas else faces_of(image.pixels, stated=image.layout)
     said = []
