@@ -138,10 +138,10 @@ MODELS = ("ndf", "masking", "fresnel", "diffuse", "brdf", "light")
 
 
 class Sent(msgspec.Struct, frozen=True):
-    """An input that is sent by value: a file with those beside it that it refers to, or a folder of faces.
+    """An input that is sent by value: a file with the files that it refers to, or a folder of faces.
 
     main   name of the file itself, or None for a folder
-    files  bytes of each file by its name relative to the folder of the file, or to the folder
+    files  bytes of each file by its name relative to the folder
     """
 
     main: str | None
@@ -767,8 +767,8 @@ class _Finder:
 def named_files(options: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
     """Return the files that the options of an item name: models, engines, and the environment of a table.
 
-    By the path of each, its files and those beside it that it refers to, by their names relative to its folder. Raises
-    what reading them raises.
+    The result has, by the path of each, this file and the files that it refers to, by their names relative to its
+    folder. Raises the errors of reading them.
     """
     found: dict[str, dict[str, Path]] = {}
     for name in MODELS:

@@ -182,7 +182,7 @@ def render(
     as_json: bool,
 ) -> None:
     """Draw a grid of spheres, or the materials of a scene, from the files that were baked for an engine, shaded as that
-    engine does. With --truth, draw the full reflectance integral beside it."""
+    engine does. With --truth, draw the full reflectance integral next to it."""
     if truth is None:
         _refuse_options_of_the_truth(click.get_current_context().params)
         from whitefurnace.rendering import shading

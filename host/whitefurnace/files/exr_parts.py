@@ -99,7 +99,7 @@ class _Layer:
 
     @property
     def data(self) -> bool:
-        """Whether its name is that of a layer which holds no light."""
+        """True if the name is that of a layer without light, such as depth or normals."""
         words = {self.name.rpartition(".")[2], self.label.rpartition(".")[2]} - {""}
         return any(_DATA.fullmatch(word) for word in words)
 

@@ -111,7 +111,7 @@ class _Rows:
 
     @property
     def whole(self) -> bool:
-        """Whether all rows and the end of the deflated data have come."""
+        """True if all rows and the end of the deflated data have been read."""
         return not self._spans and (self._inflate.eof or self._passed > _SURPLUS)
 
     @property

@@ -40,7 +40,7 @@ class Meaning:
 
     @property
     def plain(self) -> bool:
-        """Whether the numbers are radiance as they are."""
+        """True if the numbers are radiance without any conversion."""
         return (
             self.encoding is None
             and (self.scale, self.offset) == (1.0, 0.0)

@@ -710,7 +710,7 @@ class Statistics:
 
 
 def statistics(found: Contents, level: Level) -> Statistics:
-    """Compute the statistics of a level, over bands of its rows, so that they take little memory beside the texels."""
+    """Compute the statistics of a level in bands of its rows, with little memory compared with the texels."""
     texels = level.texels
     height, width, channels = texels.shape[-3:]
     weights = np.broadcast_to(_weights(found, level), (height, width))

@@ -65,7 +65,7 @@ def integrate(
     environment: the surroundings of radiance instead of a light, as `environment` takes them, integrated over its
       texels. RGB is the last axis of the values.
     normal: the normal of the surface in the world, (0, 1, 0) by default, for an environment. Azimuths run from +X to
-      -Z, turned with the normal on the shortest way.
+      -Z under the shortest rotation from +Y to the normal.
     rotate, exposure, bad_pixels, layout, layer, fill, nonfinite: how the environment is read, as in `environment`.
     parameters: `NoV`, the cosine of the view angle in [0, 1], where the integral has a view; `phi`, its azimuth in
       radians, for anisotropic models and radiance; and the models' own (`alpha`, `f0`). An unqualified name sets the
@@ -75,9 +75,9 @@ def integrate(
     tolerance: the absolute error asked for, in (0, 1); default 1e-6 in float32 and 1e-12 in float64. For radiance it is
       that of a light of radiance 1; for an environment it is relative to the mean radiance, default 1e-5 and 1e-7. Two
       quadrature rules are compared and the values of the finer one are kept where they agree within it, or at the end
-      of the rules, with the error stated. Cells that float32 cannot do are done in float64, with a notice.
+      of the rules, with the error stated. Cells beyond float32 are computed in float64, with a notice.
     relative_tolerance: the error asked for as a share of each value, in (0, 1). Given alone, it replaces the absolute
-      tolerance, which may be small beside a value or large beside another; given with it, the larger of both holds for
+      tolerance, which may be small for one value or large for another; given with it, the larger of both holds for
       each cell. Like `epsrel` and `epsabs` of `scipy.integrate.quad`.
     backfacing: what to do with views behind the surface, NoV < 0: "clamp" to 0 or "absolute". They are refused by
       default. Light from behind gives 0.
@@ -88,7 +88,7 @@ def integrate(
     progress: called with the share done, in [0, 1], after each part of the grid.
 
     Raises UsageError for unknown names and values outside their domain, UnsupportedError for a combination that no rule
-    serves, DeviceError where no device works, and what `environment` raises.
+    supports, DeviceError where no device works, and the errors of `environment`.
     """
     models: dict[str, Any] = {"ndf": ndf, "masking": masking, "fresnel": fresnel, "diffuse": diffuse, "brdf": brdf}
     accuracy: dict[str, Any] = {"precision": precision, "tolerance": tolerance, "backfacing": backfacing}

@@ -228,7 +228,7 @@ def read_environment(
 
 
 def is_demo(source: Any) -> bool:
-    """Whether a source is the built-in environment: the word `demo`, unless there is a path of that name."""
+    """Return whether a source is the built-in environment: the word `demo`, unless a path of that name exists."""
     return isinstance(source, (str, os.PathLike)) and str(source) == DEMO and not os.path.exists(source)
 
 
@@ -261,8 +261,8 @@ def _six(path: Path, layout: str | None) -> tuple[list[Path], str] | None:
 def source_files(source: str | os.PathLike[str], layout: str | None = None) -> dict[str, Path]:
     """Return the files that `environment` opens for a path, by their names relative to its folder.
 
-    They are a file and what a glTF keeps beside it, or six faces; none for the word `demo`. Nothing else is read,
-    hashed, sent or listed for an environment. Raises as `environment` does for what is not one.
+    They are the file itself and the files that a glTF refers to, or six faces; none for the word `demo`. No other file
+    is read, hashed, sent or listed for an environment. Raises the errors of `environment` for another kind of path.
     """
     if is_demo(source):
         return {}

@@ -113,7 +113,7 @@ def lut(
 ) -> Table:
     """Write a table of an integral of a BRDF to `path`, and its manifest to `path` with .json appended.
 
-    kind: what is tabulated, a name that `whitefurnace lut --help` lists: an integral ("dfg", "albedo", …) or a table
+    kind: the kind of table, a name that `whitefurnace lut --help` lists: an integral ("dfg", "albedo", …) or a table
         made from some ("energy", "ltc", "glass", …).
     path: ends with .npy, .exr, .png, .ktx2, .dds or .h.
     size: number of cells along the default axes, N, (N, M) or "NxM", each 1 to 16384; 128 unless the kind has its own.
@@ -125,7 +125,7 @@ def lut(
         as `integrate` takes it.
     backfacing: "clamp" or "absolute" accepts NoV < 0.
     precision: 32 or 64 bits. tolerance: absolute; 1e-6, or 1e-12 with 64 bits, unless the kind has its own.
-    relative_tolerance: largest error as a share of each value, instead of the absolute one, or beside it as in
+    relative_tolerance: largest error as a share of each value, instead of the absolute one, or together with it as in
         `integrate`; for tables of integrals themselves.
     fit: "bilinear" fits the texels so that reads between them are most accurate. as_read: measure the error of such
         reads; a fit does.
@@ -139,7 +139,7 @@ def lut(
     The array is […, y, x] or […, y, x, channel] of float32 or float64. By default x is NoV = (x + ½)/N where the
     integral has a view, and y the perceptual roughness r = (y + ½)/M, smoothest in row 0; the models' own parameters
     follow it. Without a view x is r. Kinds that have other axes say so in their help. A file that exists with the same
-    key is skipped, and one that the manifest proves ours is replaced.
+    key is skipped, and a file that the manifest proves to be ours is replaced.
 
     Raises UsageError, UnsupportedError, FileError, CheckError, DeviceError, and InputError for a bad environment.
     """
