@@ -401,7 +401,7 @@ def test_transfer_functions_by_code_point(tmp_path, transfer, encode, within):
 
 
 def test_pq_is_1_at_203_nits_and_has_its_peak(tmp_path):
-    linear = pattern() @ np.linalg.inv(REC2020_TO_709).T  # in gamut: the pattern itself is Rec. 709
+    linear = pattern() @ np.linalg.inv(REC2020_TO_709).T  # in gamut: the pattern itself is Rec.709
     path = png(tmp_path / "a.png", codes16(pq_encoded(203 * linear)), (b"cICP", bytes((9, 16, 0, 1))))
     image = read_image(path)
     assert np.abs(image.pixels - pattern()).mean() < 2e-4  # the matrix has four digits
@@ -701,7 +701,7 @@ def test_tiff_states_its_curve_and_primaries(tmp_path, order):
     rationals = [(round(1000 * value), 1000) for value in xy]
     white = (5, [(3127, 10000), (3290, 10000)])
     path = tiff(tmp_path / "c.tif", [page(codes, 2, t318=white, t319=(5, rationals))], order)
-    want = np.maximum(REC2020_TO_709 @ DECODED, 0)  # red is outside the gamut of Rec. 709
+    want = np.maximum(REC2020_TO_709 @ DECODED, 0)  # red is outside the gamut of Rec.709
     np.testing.assert_allclose(read_image(path).pixels[0, 0], want, atol=2e-4)
     floats = RGBF.astype(np.dtype("f4").newbyteorder(order))
     path = tiff(tmp_path / "d.tif", [page(floats, 2, form=3, t319=(5, rationals))], order)
@@ -891,6 +891,12 @@ def test_gamma_and_primaries_by_exif(tmp_path, suffix):
     image = read_image(path)
     np.testing.assert_allclose(image.pixels, (99 / 255) ** 1.8, rtol=0.01)
     assert "its Exif (gamma 1.8, primaries 0.68" in image.notices[0]
+
+
+def test_a_gain_map_is_told(tmp_path):
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/" hdrgm:Version="1.0"/>'
+    Pillow.fromarray(RGB8).save(tmp_path / "a.jpg", xmp=xmp)
+    assert "gain map" in read_image(tmp_path / "a.jpg").notices[0]
 
 
 def test_panoramas_say_what_they_are(tmp_path):

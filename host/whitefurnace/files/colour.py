@@ -1,4 +1,4 @@
-"""Colour encodings of image files: transfer functions, primaries and their conversion to linear Rec. 709.
+"""Colour encodings of image files: transfer functions, primaries and their conversion to linear Rec.709.
 
 An `Encoding` says how the stored values of an image become radiance. The transfer functions and primaries with numbers
 are those of ITU-T H.273, which PNG, JPEG XL and AVIF name by code points.
@@ -92,7 +92,7 @@ SRGB_CURVE = Curve("sRGB", _srgb)
 _HLG = Curve("HLG", _hlg, bounded=True)
 # By transfer characteristics of H.273, table 3.
 _TRANSFERS = {
-    **dict.fromkeys((1, 6, 14, 15), Curve("Rec. 709", _rec709)),
+    **dict.fromkeys((1, 6, 14, 15), Curve("Rec.709", _rec709)),
     4: Curve("a power of 2.2", power(2.2).decode),
     5: Curve("a power of 2.8", power(2.8).decode),
     7: Curve("SMPTE 240M", _smpte240),
@@ -104,7 +104,7 @@ _TRANSFERS = {
 _D65 = (0.3127, 0.3290)
 # By colour primaries of H.273, table 2, as xy of red, green, blue and white.
 _PRIMARIES = {
-    1: ("Rec. 709", REC709),
+    1: ("Rec.709", REC709),
     4: ("BT.470 M", (0.67, 0.33, 0.21, 0.71, 0.14, 0.08, 0.310, 0.316)),
     5: ("BT.601 625", (0.64, 0.33, 0.29, 0.60, 0.15, 0.06, *_D65)),
     6: ("BT.601 525", (0.630, 0.340, 0.310, 0.595, 0.155, 0.070, *_D65)),
@@ -120,10 +120,10 @@ _HLG_GAMMA, _HLG_PEAK = 1.2, 1000.0
 
 @dataclass(frozen=True)
 class Encoding:
-    """The conversion of stored values to linear Rec. 709: a curve for each channel, then a matrix.
+    """The conversion of stored values to linear Rec.709: a curve for each channel, then a matrix.
 
     curves     one curve for all colour channels, or those of R, G and B
-    matrix     (3, 3) from the linear channels to Rec. 709; None for none
+    matrix     (3, 3) from the linear channels to Rec.709; None for none
     luminance  weights of R, G and B in the luminance that drives HLG's OOTF; None for another encoding
     narrow     True if integers use the narrow ("video") range of codes
     said       name of the statement in the file, such as "its cICP chunk (BT.2020, PQ)"; empty for no notice
@@ -136,7 +136,7 @@ class Encoding:
     narrow: bool = False
 
     def is_near(self, curve: Curve) -> bool:
-        """Return whether the values are Rec. 709 with this curve, but for rounding."""
+        """Return whether the values are Rec.709 with this curve, but for rounding."""
         return self.matrix is None and not self.narrow and self.luminance is None and _all_near(self.curves, curve)
 
     def tables(self, dtype: npt.DTypeLike) -> tuple[npt.NDArray[np.float32], ...]:
@@ -180,9 +180,9 @@ class Encoding:
                     values[...] = curve.decode(values.astype(np.float64))
 
     def to_rec709(self, pixels: npt.NDArray[np.float32]) -> str:
-        """Convert decoded `pixels` (height, width, 1 | 3 | 4) to Rec. 709 in place.
+        """Convert decoded `pixels` (height, width, 1 | 3 | 4) to Rec.709 in place.
 
-        Colours outside the gamut of Rec. 709 would be negative; those channels become 0, and the sentence that is
+        Colours outside the gamut of Rec.709 would be negative; those channels become 0, and the sentence that is
         returned says how many. It is empty where there are none.
         """
         colour = pixels.shape[2] >= 3
@@ -216,7 +216,7 @@ class Encoding:
             return ""
         share = 100 * lost / total if total > 0 else 0.0
         return (
-            f"{count} values outside the gamut of Rec. 709 became 0; the least was {least:.3g}, "
+            f"{count} values outside the gamut of Rec.709 became 0; the least was {least:.3g}, "
             f"all were {share:.2g} % of the energy"
         )
 
@@ -248,7 +248,7 @@ def rgb_to_xyz(primaries: Sequence[float]) -> Array:
 
 
 def matrix_to_rec709(to_xyz: Array, white: Sequence[float]) -> Array | None:
-    """Return the matrix from linear RGB to linear Rec. 709, with Bradford adaptation of the white to D65.
+    """Return the matrix from linear RGB to linear Rec.709, with Bradford adaptation of the white to D65.
 
     to_xyz: the matrix from RGB to XYZ. white: XYZ of the white that becomes D65. Returns None for a matrix that is the
     identity but for rounding. Raises `ValueError` for a matrix that spans no colour space.

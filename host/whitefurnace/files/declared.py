@@ -28,7 +28,7 @@ from whitefurnace.files.icc import MAX_BYTES, read_icc
 from whitefurnace.files.inputs import open_input
 from whitefurnace.files.tiff import read_tiff
 
-# OpenImageIO's names of colour spaces with the primaries of Rec. 709; "" and None stand for nothing stated.
+# OpenImageIO's names of colour spaces with the primaries of Rec.709; "" and None stand for nothing stated.
 _SPACES = {"srgb_rec709_scene": SRGB_CURVE, "sRGB": SRGB_CURVE, "lin_rec709_scene": LINEAR, "linear": LINEAR}
 
 
@@ -119,7 +119,7 @@ def _by_attributes(spec: Any, form: str, path: Path, channels: int) -> Encoding 
     transfer = spec.get_string_attribute("dpx:Transfer")
     if transfer not in ("", "Undefined", "User defined", "Linear", "Logarithmic"):
         raise InputError(f"{path} states the transfer function {transfer!r}, which is not read; convert it to EXR")
-    # Netpbm's specification names the curve of Rec. 709, programs write sRGB.
+    # Netpbm's specification names the curve of Rec.709, programs write sRGB.
     if form == "pnm" or not space:
         return None
     curve = power(gamma) if gamma > 0 else _SPACES.get(space)

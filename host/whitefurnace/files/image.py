@@ -309,7 +309,7 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
 def _radiance(
     source: Any, spec: Any, picks: list[int], path: Path, pixel: str, declared: Declared, notices: list[str]
 ) -> tuple[npt.NDArray[np.float32], float]:
-    """Read the pixels and bring them to linear Rec. 709 by the encoding that the file states.
+    """Read the pixels and bring them to linear Rec.709 by the encoding that the file states.
 
     Returns the largest value that they can hold too.
     """

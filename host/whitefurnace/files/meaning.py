@@ -23,9 +23,9 @@ STRAIGHT_ORDER = "rgba"
 
 @dataclass(frozen=True, eq=False)
 class Meaning:
-    """The conversion of decoded numbers to linear Rec. 709 radiance.
+    """The conversion of decoded numbers to linear Rec.709 radiance.
 
-    encoding       curves and primaries of the colours; None for linear Rec. 709
+    encoding       curves and primaries of the colours; None for linear Rec.709
     scale, offset  colours are x·scale + offset, after the curves
     order          source of red, green, blue and alpha: one of r g b a, or 0 or 1 for a constant
     alpha          "straight", "premultiplied" where colours were multiplied by it, or "none" where it is not coverage

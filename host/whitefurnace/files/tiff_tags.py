@@ -82,9 +82,9 @@ def _order(data: mmap.mmap | bytes) -> str:
 
 
 def chromaticities(tags: Mapping[int, Values], path: Path) -> tuple[npt.NDArray[np.float64] | None, str]:
-    """Return the matrix to Rec. 709 of the tags WhitePoint and PrimaryChromaticities, and their numbers for people.
+    """Return the matrix to Rec.709 of the tags WhitePoint and PrimaryChromaticities, and their numbers for people.
 
-    Those of Rec. 709 stand for a tag that is missing. Raises `InputError` for primaries that span no colour space.
+    Those of Rec.709 stand for a tag that is missing. Raises `InputError` for primaries that span no colour space.
     """
     xy = [float(value) for value in (*tags.get(PRIMARIES, REC709[:6]), *tags.get(WHITE, REC709[6:]))]
     shown = " ".join(f"{value:.4g}" for value in xy[:8])
