@@ -9,6 +9,8 @@ import random
 import struct
 import zlib
 
+from changed_values import changed_env, changed_json
+
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -284,5 +286,14 @@ def webp(data: bytes, rng: random.Random) -> bytes:
     return b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body
 
 
-STRUCTURED = {".png": png, ".hdr": hdr, ".tif": tif, ".jpg": jpg, ".webp": webp}
+STRUCTURED = {
+    ".png": png,
+    ".hdr": hdr,
+    ".tif": tif,
+    ".jpg": jpg,
+    ".webp": webp,
+    ".gltf": changed_json,
+    ".json": changed_json,
+    ".env": changed_env,
+}
 """The mutation of each suffix; files of others are mutated byte by byte."""

@@ -22,10 +22,6 @@ HOST = Path(whitefurnace.__file__).parent
 OWN_FILES = {
     "files/atomic.py": "the staged file, to sync it",
     "files/inputs.py": "the door",
-    "files/declared.py": "an image that files/image.py has opened by the door",
-    "files/hdr_header.py": "an image that files/image.py has opened by the door",
-    "files/integrity.py": "an image that files/image.py has opened by the door",
-    "files/tiff.py": "an image that files/image.py has opened by the door",
     "files/lock.py": "lock files, without following links",
     "files/memory.py": "what the system says of its memory",
     "files/npy.py": "the staged file",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import math
 import os
@@ -18,6 +19,8 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from changed_values import changed, every
+from changed_values import put as with_value
 from scenes import WHOLE, as_glb, document, uri, written
 from whitefurnace import integrate
 from whitefurnace.advice.needs import NEGLIGIBLE, TABLE, Needs, lobes, needs, read_shares, write_job
@@ -30,6 +33,7 @@ from whitefurnace.errors import FileError, InputError, UnsupportedError, UsageEr
 from whitefurnace.files import read_stored
 from whitefurnace.files.png import encode_png
 from whitefurnace.prefiltering.recipe import chain
+from whitefurnace.scenes.material_spheres import insulator, of_scene
 from whitefurnace.scenes.materials import PROPERTIES, Scene, read_scene
 
 pytest.importorskip("pygltflib")
@@ -116,6 +120,70 @@ def test_a_factor_and_a_texture_multiply_in_the_channels_of_the_specification(
 
 def test_the_specified_properties_are_those_that_have_a_texture():
     assert {row[0] for row in SPECIFIED} == {p.name for p in PROPERTIES if p.texture}
+
+
+GLOSSY = {"diffuseFactor": [0.5, 0.2, 0.1, 1], "specularFactor": [0.9, 0.7, 0.3], "glossinessFactor": 0.7}
+
+
+def test_specular_glossiness_is_a_material(tmp_path):
+    """r = 1 − glossiness; F0 and the diffuse colour as given [KHR_materials_pbrSpecularGlossiness]."""
+    doc = document([{**pbr(metallicFactor=1, roughnessFactor=1), **with_extension("pbrSpecularGlossiness", **GLOSSY)}])
+    doc["extensionsRequired"] = ["KHR_materials_pbrSpecularGlossiness"]
+    scene = read_scene(written(tmp_path / "s.gltf", doc))
+    (m,) = scene.materials
+    assert m["roughness"].low == m["roughness"].high == pytest.approx((0.3,)) and m.unread == ()
+    assert m["base_color"].low == (0.5, 0.2, 0.1) and m["metalness"].low == (0.0,)
+    assert insulator(m) == pytest.approx((0.9, 0.7, 0.3))
+    # c_diff = diffuse · (1 − max(specular))
+    assert m.diffuse_share(insulator(m)) == pytest.approx(0.1)
+    said = verdicts(needs(scene, ENGINES["raw"]))
+    # the levels on either side of r = .3, at r = .293 and .5
+    assert [said[f"level {k}"] for k in range(5)] == [False, False, True, True, False] and said["irradiance"]
+    black = with_extension("pbrSpecularGlossiness", **{**GLOSSY, "diffuseFactor": [0, 0, 0, 1]})
+    assert not verdicts(needs(scene_of(tmp_path, black), ENGINES["raw"]))["irradiance"]
+    sphere = of_scene(scene, 1).spheres[0]
+    assert sphere.base_color == pytest.approx((0.05, 0.02, 0.01)) and sphere.insulator == pytest.approx((0.9, 0.7, 0.3))
+    (default,) = scene_of(tmp_path, with_extension("pbrSpecularGlossiness")).materials
+    assert default["roughness"].low == (0.0,) and insulator(default) == (1, 1, 1)
+
+
+def test_glossiness_is_in_alpha_and_specular_in_the_colours(tmp_path):
+    image = np.zeros((4, 8, 4), np.uint8)
+    image[..., :3] = [CODES[c] for c in "RGB"]
+    image[:, :4, 3], image[:, 4:, 3] = 51, 204
+    values = {**GLOSSY, "specularGlossinessTexture": {"index": 0}, "diffuseTexture": {"index": 0}}
+    (m,) = scene_of(tmp_path, with_extension("pbrSpecularGlossiness", **values), images=[image]).materials
+    gloss = 0.7 * np.array([51, 204]) / 255
+    r = m["roughness"]
+    # sRGB tables are float32: 6e-8 of a value
+    assert (r.least, r.most) == pytest.approx((1 - gloss[1], 1 - gloss[0])) and r.mean == pytest.approx(
+        (1 - gloss.mean(),)
+    )
+    assert r.given == "texture" and [k for k, share in enumerate(r.histogram) if share] == [
+        *(int(64 * (1 - g)) for g in gloss[::-1])
+    ]
+    for name, factors in (("specular_color", (0.9, 0.7, 0.3)), ("base_color", (0.5, 0.2, 0.1))):
+        wanted = [f * linear(CODES[c]) for f, c in zip(factors, "RGB", strict=True)]
+        assert m[name].low == m[name].high == pytest.approx(wanted, rel=1e-6)
+    doc = document([with_extension("pbrSpecularGlossiness", **values)], [image])
+    doc["textures"] = [{"extensions": {"KHR_texture_basisu": {"source": 0}}}]
+    unseen = read_scene(written(tmp_path / "u.gltf", doc)).materials[0]["roughness"]
+    assert (unseen.least, unseen.most, unseen.seen) == (pytest.approx(0.3), 1.0, False)
+
+
+def test_an_image_is_what_its_bytes_are(tmp_path):
+    """A WebP, as Pillow writes it, by its own bytes: without a type, with a wrong one, in an extension."""
+    image = pytest.importorskip("PIL.Image")
+    data = io.BytesIO()
+    image.fromarray(np.full((8, 8, 3), 102, np.uint8)).save(data, "WEBP", lossless=True)
+    for given in ({"uri": uri(data.getvalue(), "image/webp")}, {"uri": uri(data.getvalue()), "mimeType": "image/png"}):
+        doc = document([pbr(metallicRoughnessTexture={"index": 0})], [ramp(4, 4)])
+        doc["images"], doc["textures"] = [given], [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
+        r = read_scene(written(tmp_path / "s.gltf", doc)).materials[0]["roughness"]
+        assert r.seen and r.low == r.high == pytest.approx((102 / 255,))
+    doc["images"] = [{"uri": uri(b"GIF89a" + bytes(20)), "mimeType": "image/png"}]
+    with pytest.raises(InputError, match="neither PNG, JPEG nor WebP"):
+        read_scene(written(tmp_path / "s.gltf", doc))
 
 
 def test_values_without_textures_and_what_is_default(tmp_path):
@@ -765,8 +833,17 @@ def test_what_is_no_gltf_is_one_sentence(tmp_path, text):
 
 
 def test_what_a_file_requires_and_is_not_known(tmp_path):
-    with pytest.raises(UnsupportedError, match="VENDOR_geometry"):
-        read_scene(written(tmp_path / "s.gltf", broken(put("extensionsRequired", ["VENDOR_geometry"]))))
+    with pytest.raises(UnsupportedError, match="requires VENDOR_geometry, EXT_x, which are not read"):
+        read_scene(
+            written(
+                tmp_path / "s.gltf",
+                broken(put("extensionsRequired", ["KHR_materials_ior", "VENDOR_geometry", "EXT_x"])),
+            )
+        )
+    with pytest.raises(
+        UnsupportedError, match="KHR_materials_sheem, which is not read; did you mean 'KHR_materials_sh"
+    ):
+        read_scene(written(tmp_path / "s.gltf", broken(put("extensionsRequired", ["KHR_materials_sheem"]))))
 
 
 def test_nodes_may_be_nested_deep(tmp_path):
@@ -789,55 +866,8 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return bytes(made)
 
 
-VALUES = [
-    None,
-    True,
-    -1,
-    0,
-    1,
-    2.5,
-    1e300,
-    -1e300,
-    math.inf,
-    math.nan,
-    1 << 40,
-    10**400,
-    "",
-    "x",
-    [],
-    {},
-    [0],
-    [{}],
-    {"index": 0},
-    [[]],
-    65536,
-]
-
-
-def replaced(doc: dict[str, Any], rng: random.Random) -> dict[str, Any]:
-    """Some values anywhere in it replaced or removed."""
-    doc = json.loads(json.dumps(doc))
-    for _ in range(rng.randrange(1, 4)):
-        at: Any = doc
-        while True:
-            keys = list(at) if isinstance(at, dict) else list(range(len(at)))
-            if not keys:
-                break
-            key = rng.choice(keys)
-            if isinstance(at[key], dict | list) and rng.random() < 0.8:
-                at = at[key]
-            elif rng.random() < 0.2:
-                del at[key]
-                break
-            else:
-                at[key] = rng.choice(VALUES)
-                break
-    return doc
-
-
-@pytest.mark.parametrize("count", [150, pytest.param(600, marks=pytest.mark.long)])
-def test_anything_at_all_is_read_or_refused(tmp_path, count):
-    rng = random.Random(5)
+def with_everything() -> dict[str, Any]:
+    """A scene with every property, a camera, a sampler, and images beside it and inside."""
     extensions = {
         f"KHR_materials_{row[1]}": {row[2]: 0.5 if len(row[4]) == 1 else [0.5] * 3, row[3]: {"index": 0}}
         for row in SPECIFIED
@@ -848,6 +878,13 @@ def test_anything_at_all_is_read_or_refused(tmp_path, count):
     doc["nodes"].append({"camera": 0, "rotation": [0, 0, 0, 1], "scale": [1, 1, 1]})
     doc["samplers"] = [{"wrapS": 33071}]
     doc["textures"][0]["sampler"] = 0
+    return doc
+
+
+@pytest.mark.parametrize("count", [150, pytest.param(600, marks=pytest.mark.long)])
+def test_anything_at_all_is_read_or_refused(tmp_path, count):
+    rng = random.Random(5)
+    doc = with_everything()
     read_scene(written(tmp_path / "whole.gltf", doc))
     whole = as_glb(tmp_path / "whole.glb", doc).read_bytes()
     refused, file = 0, tmp_path / "s.glb"
@@ -856,7 +893,7 @@ def test_anything_at_all_is_read_or_refused(tmp_path, count):
         if k % 2:
             file.write_bytes(mutated(whole, rng))
         else:
-            written(file, replaced(doc, rng))
+            written(file, changed(doc, rng))
         try:
             scene = read_scene(file)
             for engine in ("raw", "khronos"):
@@ -868,6 +905,38 @@ def test_anything_at_all_is_read_or_refused(tmp_path, count):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert refused > count / 3 and peak < 100e6, (refused, peak)  # the file itself is 10 kB
+
+
+@pytest.mark.parametrize("count", [600, pytest.param(0, marks=pytest.mark.long)])
+def test_a_value_of_any_type_anywhere_in_a_glTF_is_read_or_refused(tmp_path, count):
+    """Every value is replaced by one of every type; `count` of these files, or all of them for 0."""
+    doc = with_everything()
+    doc["nodes"][0]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
+    doc["meshes"][0]["primitives"][0]["extensions"] = {"KHR_materials_variants": {"mappings": [{"material": 0}]}}
+    texture = doc["materials"][0]["pbrMetallicRoughness"]["metallicRoughnessTexture"]
+    texture["extensions"] = {"KHR_texture_transform": {"scale": [1, 1], "offset": [0, 0], "rotation": 0, "texCoord": 0}}
+    doc["images"][0] = {"bufferView": 3, "mimeType": "image/png"}
+    data = encode_png(ramp(4, 8))
+    doc["bufferViews"].append({"buffer": 1, "byteOffset": 0, "byteLength": len(data)})
+    doc["buffers"].append({"byteLength": len(data), "uri": uri(data)})
+    doc["extensionsRequired"] = ["KHR_texture_transform"]
+    read_scene(written(tmp_path / "whole.gltf", doc))
+    changes = every(doc)
+    if count:
+        changes = random.Random(6).sample(changes, count)
+    refused, wrong, file = 0, [], tmp_path / "s.gltf"
+    for path, value in changes:
+        made = with_value(doc, path, value)
+        try:
+            needs(read_scene(written(file, made)), ENGINES["raw"])
+        except WhitefurnaceError as error:
+            refused += 1
+            if "\n" in str(error) or len(str(error)) > 500:
+                wrong.append((path, value, str(error)))
+        except Exception as error:
+            wrong.append((path, value, repr(error)))
+    assert not wrong, (len(wrong), wrong[:9])
+    assert len(changes) / 3 < refused < len(changes)
 
 
 # ------------------------------------------------------------------------------------------------- others' files

@@ -189,6 +189,7 @@ def diffuse_weight(engine: Engine, m: Material) -> float:
     most = m["diffuse_transmission"].most
     for metal in (m["metalness"].least, m["metalness"].most):
         color = np.array(m["base_color"].high) * (1 - m["transmission"].least * (1 - metal))
+        color *= m.diffuse_share(m["specular_color"].low)
         weights = SHADINGS[engine.shading](
             A[:, None], B[:, None], color[None], np.full((len(r), 1), metal), r[:, None], NoV[:, None]
         )

@@ -80,10 +80,10 @@ def sample_points(scene: Scene, *, least: float = 0.0, count: int = POINTS, seed
     metal, r, ior = np.empty(count), np.empty(count), np.empty(count)
     for k in np.unique(place):
         some, m = np.flatnonzero(place == k), scene.materials[k]
-        color[some] = middle(m["base_color"])
         metal[some] = _drawn(m["metalness"], len(some), rng)
         r[some] = _drawn(m["roughness"], len(some), rng)
         f0[some], ior[some] = _insulator(m)
+        color[some] = middle(m["base_color"]) * m.diffuse_share(insulator(m))
     r = np.maximum(r, least)
     r[r < SMOOTHEST] = 0.0
     n = rng.normal(size=(3, count))

@@ -350,10 +350,12 @@ def _spread_text(spread: Spread) -> str:
 
 def _also(m: Material) -> list[str]:
     """Further values of a material that its file gives, as text."""
-    core = ("base_color", "metalness", "roughness")
+    core, names = ["base_color", "metalness", "roughness"], {}
+    if m.has("pbrSpecularGlossiness"):  # its F0 stands in the specular colour, under an infinite ior
+        core, names = [*core, "ior"], {"specular_color": "F0"}
     words = ["unlit"] if m.unlit else []
     return words + [
-        f"{name.replace('_', ' ')} {_spread_text(spread)}"
+        f"{names.get(name, name).replace('_', ' ')} {_spread_text(spread)}"
         for name, spread in m.values.items()
         if name not in core and spread.given != "default"
     ]

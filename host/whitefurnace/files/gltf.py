@@ -7,6 +7,7 @@ interprets the contents.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,11 @@ from whitefurnace.errors import FileError, InputError
 from whitefurnace.files.binary import Source, load
 from whitefurnace.files.gltf_lights import GLB_MAGIC, _document, _Images
 from whitefurnace.files.image import MAX_PIXELS, _check_size, _complaint, _reason
-from whitefurnace.files.inputs import head_of
+from whitefurnace.files.inputs import head_of, plain_name
 from whitefurnace.files.integrity import check_file
 from whitefurnace.files.jsontext import Reader
 from whitefurnace.files.png import _scratch_file
+from whitefurnace.text import printable
 
 MAX_VALUES = 4_000_000
 """Largest number of values in a file's JSON, counted by commas and brackets: a few hundred megabytes in Python."""
@@ -32,7 +34,11 @@ MAX_ELEMENTS = 1 << 26
 COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 TYPES = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
-_SUFFIX = {"image/png": ".png", "image/jpeg": ".jpg", "image/webp": ".webp"}
+_MAGIC = (
+    (".png", re.compile(rb"\x89PNG\r\n\x1a\n")),
+    (".jpg", re.compile(rb"\xff\xd8\xff")),
+    (".webp", re.compile(rb"RIFF....WEBP", re.DOTALL)),
+)
 _BAND = 8 << 20
 
 Codes = npt.NDArray[np.uint8] | npt.NDArray[np.uint16]
@@ -74,13 +80,14 @@ class Gltf:
         not of one of `types` or reaches beyond its buffer.
         """
         accessors = self.take.array(self.document.get("accessors", []), "accessors", 0, 1 << 20)
-        name = f"accessor {self.index(k, len(accessors), what)}"
+        k = self.index(k, len(accessors), what)
+        name = f"accessor {k}"
         one = self.take.object(accessors[k], name)
         kind = self.take.text(one.get("type"), f"the type of {name}")
         component = self.take.whole(one.get("componentType"), f"componentType of {name}", 0, 1 << 16)
         if kind not in types or component not in COMPONENTS:
             raise self.source.wrong(
-                f"{name}, {what}, is of {kind[:20]} and componentType {component}; "
+                f"{name}, {what}, is of {plain_name(kind, 20)} and componentType {component}; "
                 f"{' or '.join(types)} of {', '.join(map(str, COMPONENTS))} were expected"
             )
         count = self.take.whole(one.get("count"), f"count of {name}", 1, MAX_ELEMENTS)
@@ -126,7 +133,7 @@ class Gltf:
         try:
             data = self._pieces._buffer(k)
         except FileError as error:  # a scene without its buffers is not valid
-            raise self.source.wrong(f"buffer {k} is missing: {error}") from None
+            raise self.source.wrong(f"buffer {k} is missing: {printable(str(error))}") from None
         if stated > len(data):
             raise self.source.wrong(f"buffer {k} should have {stated} bytes, {len(data)} are there")
         return data[:stated]
@@ -143,16 +150,14 @@ class Gltf:
         try:
             data = self._pieces._bytes(k)
         except FileError as error:
-            raise self.source.wrong(f"image {k}, {what}, is missing: {error}") from None
+            raise self.source.wrong(f"image {k}, {what}, is missing: {printable(str(error))}") from None
         name = f"{self.source.name}: image {k}, {what},"
-        mime = image.get("mimeType")
-        if bytes(data[:8]) == b"\x89PNG\r\n\x1a\n":
-            mime = "image/png"
-        elif bytes(data[:3]) == b"\xff\xd8\xff":
-            mime = "image/jpeg"
-        if mime not in _SUFFIX:
+        self.take.text(image.get("mimeType", ""), f"the mimeType of image {k}")
+        head = bytes(data[:12])  # decides what it is, since mimeType is often wrong and may be left out for a URI
+        suffix = next((suffix for suffix, magic in _MAGIC if magic.match(head)), None)
+        if suffix is None:
             raise InputError(f"{name} is neither PNG, JPEG nor WebP")
-        with _scratch_file(_SUFFIX[mime]) as path:
+        with _scratch_file(suffix) as path:
             path.write_bytes(data)
             try:
                 yield from _decoded(path, len(data))

@@ -22,11 +22,13 @@ from urllib.parse import unquote_to_bytes
 import numpy as np
 import numpy.typing as npt
 
+from whitefurnace.errors import WhitefurnaceError
 from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import MAX_BYTES, Source, load
 from whitefurnace.files.inputs import inside, plain_name
 from whitefurnace.files.jsontext import Reader, parse_object
 from whitefurnace.files.rgbd import MAX_SIZE, Level, check_chain, decode_face, encode_faces
+from whitefurnace.text import printable
 
 NAME = "EXT_lights_image_based"
 GLB_MAGIC = b"glTF"
@@ -324,7 +326,10 @@ class _Images:
             except (binascii.Error, ValueError):
                 raise self._source.wrong(f"the data URI of {what} is not valid base64") from None
         (path,) = self._place(uri, what).values()
-        return load(path).view
+        try:
+            return load(path).view
+        except WhitefurnaceError as error:  # the name may hold line breaks
+            raise type(error)(printable(str(error))) from None
 
     def _place(self, value: Any, what: str) -> dict[str, Path]:
         """Return the file of a URI by its name relative to the folder of the glTF; empty for a data URI."""

@@ -129,7 +129,7 @@ def of_scene(scene: Scene, columns: int = 7) -> SphereLayout:
         notices.append(f"{_some(unlit)}: unlit, no sphere is drawn of it")
     made = tuple(
         MaterialSphere(
-            _triple(np.clip(middle(m["base_color"]), 0, 1)),
+            _triple(np.clip(middle(m["base_color"]) * m.diffuse_share(insulator(m)), 0, 1)),
             float(middle(m["metalness"])[0]),
             float(middle(m["roughness"])[0]),
             insulator(m),

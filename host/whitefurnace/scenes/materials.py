@@ -17,6 +17,7 @@ import numpy as np
 
 from whitefurnace.errors import InputError, UnsupportedError, nearest
 from whitefurnace.files import Gltf, srgb_table
+from whitefurnace.text import printable
 
 MAX_NODES, MAX_MATERIALS, MAX_MESHES = 1 << 18, 1 << 14, 1 << 18
 """Largest numbers that a scene may have. A real scene has fewer; a node is read in 65 µs, a material in 1.5 ms."""
@@ -112,9 +113,22 @@ PROPERTIES = (
 )
 """Every value that is read, in the order of the extensions' specifications."""
 
+GLOSSINESS = _KHR + "pbrSpecularGlossiness"
+
+GLOSSY_PROPERTIES = (
+    # Its specularGlossinessTexture holds F0 in sRGB and glossiness, which is linear, in alpha.
+    Property("base_color", GLOSSINESS, "diffuseFactor", (1.0, 1.0, 1.0), "diffuseTexture", "RGB", srgb=True),
+    Property(
+        "specular_color", GLOSSINESS, "specularFactor", (1.0, 1.0, 1.0), "specularGlossinessTexture", "RGB", srgb=True
+    ),
+    Property("roughness", GLOSSINESS, "glossinessFactor", (1.0,), "specularGlossinessTexture", "A"),
+)
+"""The values of a specular-glossiness material, by the names of PROPERTIES that they stand for: roughness is 1 −
+glossiness, and an insulator of infinite ior (written as 0) has the specular colour as its F0 [KHR_materials_ior]."""
+
 UNLIT = _KHR + "unlit"
 
-KNOWN = {p.extension for p in PROPERTIES} | {UNLIT}
+KNOWN = {p.extension for p in PROPERTIES} | {UNLIT, GLOSSINESS}
 
 Given = Literal["default", "factor", "texture"]
 
@@ -179,6 +193,13 @@ class Material:
 
     def __getitem__(self, name: str) -> Spread:
         return self.values[name]
+
+    def diffuse_share(self, specular: Iterable[float]) -> float:
+        """Return the factor of the base colour in diffuse light, in [0, 1], where F0 is `specular` (3,).
+
+        It is 1 − max(F0) in specular-glossiness [KHR_materials_pbrSpecularGlossiness, c_diff], and 1 otherwise.
+        """
+        return max(1 - max(specular), 0.0) if GLOSSINESS in self.given else 1.0
 
     def has(self, extension: str) -> bool:
         """Return whether the material has KHR_materials_`extension`."""
@@ -247,7 +268,7 @@ def library() -> Any:
 
 
 # Extensions that a file may require: they are read, or they change neither materials nor extent.
-_ALLOWED = KNOWN | {
+_ALLOWED = (KNOWN - {"", _PBR}) | {
     "KHR_texture_transform",
     "KHR_lights_punctual",
     "KHR_mesh_quantization",
@@ -261,7 +282,6 @@ _ALLOWED = KNOWN | {
     "KHR_node_visibility",
     "EXT_lights_image_based",
     "KHR_xmp_json_ld",
-    _KHR + "pbrSpecularGlossiness",
 }
 
 
@@ -285,12 +305,14 @@ class _Reading:
         self.notices: dict[str, None] = {}
         self.indices = 0
         required = self.take.array(gltf.document.get("extensionsRequired", []), "extensionsRequired", 0, 256)
-        for name in required:
-            if self.take.text(name, "an entry of extensionsRequired") not in _ALLOWED:
-                raise UnsupportedError(
-                    f"{gltf.path} requires {name[:60]}, which is not read"
-                    f"{nearest(name[:60], _ALLOWED) if len(name) < 60 else ''}"
-                )
+        unknown = [n for n in required if self.take.text(n, "an entry of extensionsRequired") not in _ALLOWED]
+        if unknown:
+            names = ", ".join(printable(name[:60]) for name in unknown[:5])
+            hint = nearest(unknown[0][:60], _ALLOWED)
+            raise UnsupportedError(
+                f"{gltf.path} requires {names}, which {'is' if len(unknown) == 1 else 'are'} not read"
+                f"{hint if 'did you mean' in hint and len(unknown) == 1 else ''}"
+            )
 
     def wrong(self, what: str) -> InputError:
         return self.gltf.source.wrong(what)
@@ -467,7 +489,8 @@ class _Reading:
         if "min" in one and "max" in one:
             low, high = (np.array(self._numbers(one[end], f"{end} of accessor {k}", 3)) for end in ("min", "max"))
             if one.get("normalized") is True:
-                scale = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}.get(one.get("componentType", 0), 1)
+                component = self.take.whole(one.get("componentType"), f"componentType of accessor {k}", 0, 1 << 16)
+                scale = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}.get(component, 1)
                 low, high = low / scale, high / scale
             if not np.all(low <= high):
                 raise self.wrong(f"accessor {k}, {what}, has a min above its max")
@@ -486,6 +509,8 @@ class _Reading:
         self.uses: dict[int, dict[Any, _Use]] = {}  # of each image
         for k, primitives in sorted(used.items()):
             values = {p.name: self._property(k, p, primitives) for p in PROPERTIES}
+            if k >= 0 and GLOSSINESS in (self.raw[k].get("extensions") or {}):
+                values |= self._glossy(k, primitives)
             values["iridescence_thickness"] = self._thickness(k, primitives)
             wanted.append((k, values))
         for image, uses in self.uses.items():
@@ -552,6 +577,28 @@ class _Reading:
             return lambda: Spread(value, value, value, given)
         return lambda: _spread(texture, p, np.zeros_like(factor), factor)
 
+    def _glossy(self, k: int, primitives: Sequence[dict[str, Any]]) -> dict[str, Callable[[], Spread]]:
+        """Return functions that give the spreads of a specular-glossiness material, in place of others of their names.
+
+        They hold where the material has metallic-roughness values too, which are its fallback.
+        """
+        colour, specular, glossiness = GLOSSY_PROPERTIES
+        holder, what = self._holder(k, GLOSSINESS)
+        factor, given = self._factor(holder, glossiness, what)
+        texture = self._texture(holder, glossiness.texture, what, primitives) if factor.any() else None
+        rough = (float(1 - factor[0]),)
+        return {
+            "base_color": self._property(k, colour, primitives),
+            "specular_color": self._property(k, specular, primitives),
+            "roughness": lambda: (
+                Spread(rough, rough, rough, given)
+                if texture is None
+                else _spread(texture, glossiness, np.ones_like(factor), -factor)
+            ),
+            "metalness": lambda: Spread((0.0,), (0.0,), (0.0,), "factor"),
+            "ior": lambda: Spread((0.0,), (0.0,), (0.0,), "factor"),
+        }
+
     def _thickness(self, k: int, primitives: Sequence[dict[str, Any]]) -> Callable[[], Spread]:
         """Return the spread of the iridescent film's thickness in nm.
 
@@ -577,7 +624,7 @@ class _Reading:
         if info is None:
             return None
         if not isinstance(info, dict | library().TextureInfo):
-            raise self.wrong(f"{name} of {what} is {str(info)[:40]}, an object was expected")
+            raise self.wrong(f"{name} of {what} is {printable(str(info)[:40])}, an object was expected")
         if isinstance(info, dict):
             number, coordinates, extensions = info.get("index"), info.get("texCoord", 0), info.get("extensions", {})
         else:
@@ -591,8 +638,8 @@ class _Reading:
             source = self.take.object(own["EXT_texture_webp"], f"EXT_texture_webp of {where}").get("source", source)
         if source is None:
             self.notices[
-                f"{where} is of a kind that is not decoded ({', '.join(own) or 'it has no source'}): all from "
-                "0 to its factor is assumed"
+                f"{where} is of a kind that is not decoded ({printable(', '.join(own)[:60]) or 'it has no source'}): "
+                "all from 0 to its factor is assumed"
             ] = None
             return _Use(None)
         image = self.gltf.index(source, len(self.typed.images), f"the image of {where}")
@@ -606,12 +653,16 @@ class _Reading:
             sampler = self.typed.samplers[
                 self.gltf.index(texture.sampler, len(self.typed.samplers), f"the sampler of {where}")
             ]
-            wraps = (sampler.wrapS or 10497, sampler.wrapT or 10497)
+            wraps = (self._wrap(sampler.wrapS, where), self._wrap(sampler.wrapT, where))
         key = (coordinates, moved.tobytes(), wraps, id(primitives))
         uses = self.uses.setdefault(image, {})
         if key not in uses:
             uses[key] = _Use(self._boxes(primitives, coordinates, moved, wraps) if len(uses) < 16 else None)
         return uses[key]
+
+    def _wrap(self, value: Any, where: str) -> int:
+        """Return the wrap mode of a sampler, REPEAT where there is none."""
+        return 10497 if value is None else self.take.whole(value, f"a wrap mode of the sampler of {where}", 0, 65535)
 
     def _moved(self, transform: dict[str, Any], where: str) -> np.ndarray:
         """Return the matrix (2, 3) of KHR_texture_transform: translation · rotation · scale."""
@@ -672,7 +723,7 @@ class _Reading:
             given,
             uses,
             UNLIT in given,
-            tuple(e for e in given if e not in KNOWN),
+            tuple(printable(e[:60]) for e in given if e not in KNOWN),
         )
 
 
