@@ -255,8 +255,10 @@ def check_quadrature(
     assert want.size >= at_least, f"{context}: the reference converges in {want.size} cells only"
     if masking == "smith":
         assert_close(got.values, want, 1e-5, columns, context)
-    # At n·v = 1e-4 a kink may hide from three rules in a row: Cook and Torrance's does, by 2.2 times the statement.
-    stated = got.error * np.where((columns["NoV"] < 1e-3) & (MASKINGS[masking].checks.slow_rules is not None), 3, 1)
+    # At n·v = 1e-4 Kelemen's root, and a kink of an anisotropic lobe, may hide from three rules in a row.
+    panels = NDFS[name].isotropic and MASKINGS[masking].kinks is not None
+    slow = MASKINGS[masking].checks.slow_rules is not None and not panels
+    stated = got.error * np.where((columns["NoV"] < 1e-3) & slow, 3, 1)
     assert_close(got.values, want, stated + doubt, columns, f"{context}, stated error")
 
 
@@ -800,7 +802,8 @@ def test_an_albedo_that_is_infinite_is_said_to_be(device: Device) -> None:
 
 
 def test_a_missed_tolerance_is_said(device: Device) -> None:
-    missed = integrate("albedo", ndf="ggx", masking="cook_torrance", alpha=0.3, NoV=0.5, device=device)
+    # Kelemen's 1/(v·h)² has a root at grazing that no rule resolves to 1e-6.
+    missed = integrate("albedo", ndf="ggx", masking="kelemen", alpha=0.3, NoV=1e-4, device=device)
     assert missed.error > 2e-6 and any("over the tolerance" in notice for notice in missed.notices)
     met = integrate("albedo", ndf="ggx", alpha=0.3, NoV=0.5, device=device)
     assert not any("tolerance" in notice for notice in met.notices)

@@ -99,6 +99,21 @@ _LISTED = {
 
 
 @dataclass(frozen=True)
+class Kinks:
+    """The kinks of a masking or a Fresnel term, at which quadrature panels meet.
+
+    on_ring: number of values of v·m, at most, at which the model has a kink while n·m stays the same. Kernel functions
+    `…_kink`, and `…_kink_2` for a second one, return them for n·v and n·m; 2 stands for none.
+    angles: function from n·v (n,) and the parameters to the polar angles of m, (k, n) in radians, at which such a value
+    enters or leaves the directions m of a view, or at which two of them cross. NaN stands for none; where all are NaN
+    the cell has no kink.
+    """
+
+    on_ring: int
+    angles: Callable[..., np.ndarray]
+
+
+@dataclass(frozen=True)
 class Model:
     """One model of a slot: everything that the engine, the tests and the documents know about it.
 
@@ -114,6 +129,7 @@ class Model:
     checks: facts that the engine and the tests act on. notes: further facts, in prose, for readers alone.
     constants: function from the parameters to float64 numbers that depend on them alone, such as a norm. Kernel
     functions take them after the parameters, in the order of `constant_names`.
+    kinks: where a masking or a Fresnel term has kinks; None for a smooth one.
     presets: named parameter sets, RGB as three numbers.
     limits: exact values by name. Each is a function from the parameters to the argument of the reference and its value
     there, NaN where there is none.
@@ -141,6 +157,7 @@ class Model:
     constant_names: tuple[str, ...] = ()
     presets: Mapping[str, Mapping[str, float | tuple[float, float, float]]] = field(default_factory=dict)
     limits: Mapping[str, Callable[..., tuple[Any, Any]]] = field(default_factory=dict)
+    kinks: Kinks | None = None
     text: str | None = None
     path: str | None = None
     function: str = ""

@@ -26,3 +26,16 @@ def held(values, low, high):
     below, above = (slack * (abs(end) or (1.0 if (low, high) == (0, 1) else 0.0)) for end in (low, high))
     array = np.where((array < low) & (array >= low - below), low, array)
     return np.where((array > high) & (array <= high + above), high, array)
+
+
+def critical_angles(NoV, sine):
+    """Return the polar angles of m at which v·m of a ring begins or ceases to reach a critical angle: (3, n).
+
+    sine: sine of the critical angle, NaN for none. The first two lie in the plane of incidence, the third where l is at
+    the horizon, since v·m is n·v/(2 n·m) there.
+    """
+    NoV, sine = np.broadcast_arrays(np.asarray(NoV, np.float64), np.asarray(sine, np.float64))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        critical, view = np.arcsin(sine), np.arccos(NoV)
+        horizon = np.arccos(NoV / (2 * np.cos(critical)))
+    return np.stack([np.abs(view - critical), view + critical, horizon])

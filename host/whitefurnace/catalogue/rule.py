@@ -82,6 +82,21 @@ LADDERS = {
         (112, 168, 64),
         (160, 240, 96),
     ),
+    # kinked.cl: panels between the kinks, in both angles
+    "kinked": _ladder(
+        "kinked",
+        1,
+        (0, 8, 5),
+        (0, 10, 6),
+        (0, 12, 8),
+        (0, 16, 11),
+        (0, 20, 14),
+        (0, 28, 20),
+        (0, 40, 28),
+        (0, 56, 40),
+        (0, 80, 56),
+        (0, 120, 80),
+    ),
     # dfg_ggx.cl: three panels over the light's polar angle, an azimuth in closed form but for Schlick's part
     "light-angles": _ladder(
         "light-angles",

@@ -144,8 +144,8 @@ def _furthest(
     errors: np.ndarray, size: np.ndarray, tolerance: float, relative: float, precision: int
 ) -> tuple[float, float, float]:
     """Return the largest ratio of an error to what the cell allows, with that error and the size of its value."""
-    allowed = np.maximum(np.maximum(tolerance, relative * size), ROUNDING[precision] * size)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore"):  # values that are infinite, as Minnaert's at grazing
+        allowed = np.maximum(np.maximum(tolerance, relative * size), ROUNDING[precision] * size)
         ratio = np.where(np.isfinite(size) & (errors > 0), errors / allowed, 0.0)
     worst = int(np.argmax(ratio))
     return float(ratio[worst]), float(errors[worst]), float(size[worst])
@@ -222,6 +222,11 @@ def table_spec(
     slots = slots_of(entry, ndf, masking, fresnel, diffuse, brdf)
     shape = grid_of(entry, slots, dict(parameters), backfacing).shape
     digests = [_program(entry, some, 0).digest for some in summands_of(slots)]
+    digests += [
+        source.kinked(_integrand(entry), some, count).digest
+        for some in summands_of(slots)
+        if entry.support == "HALF_ANGLE" and "ndf" in some and some["ndf"].isotropic and (count := edge_count(some))
+    ]
     digests += [source.closed(own, some).digest for some in summands_of(slots) if (own := own_kernel_of(entry, some))]
     if "ndf" in slots and slots["ndf"].model.isotropic:
         digests.append(source.area(slots["ndf"].model).digest)  # of the table, should it be needed
@@ -440,6 +445,7 @@ class Part:
     """One summand of the BRDF on a device: the specular one, the diffuse one or a user's whole BRDF.
 
     closed  kernel file of an integral that has its own, or None
+    kinked  True for cells whose panels meet at the kinks of their models
     areas   tables of Smith's area by precision
     norms   smallest and largest norm of a user's NDF so far
     """
@@ -449,6 +455,7 @@ class Part:
     slots: dict[str, Model]
     precision: int
     closed: str | None = None  # the file of a kernel of its own
+    kinked: bool = False
     areas: dict[int, Areas] = field(default_factory=dict)
     norms: tuple[float, float] = (np.inf, 0.0)
 
@@ -457,6 +464,8 @@ class Part:
         """Key of `LADDERS`: the sequence of rules with which this part is integrated."""
         if self.closed:
             return "light-angles"
+        if self.kinked:
+            return "kinked"
         if "ndf" in self.slots:
             if self.entry.support == "ALL":
                 return "polar" if self.slots["ndf"].isotropic else "stretched"
@@ -466,7 +475,7 @@ class Part:
     @property
     def view(self) -> tuple[str, ...]:
         """Names of the numbers that describe the view, the first rows of a cell."""
-        return ("NoV",) if self.kind in ("gauss", "polar", "hemisphere", "light-angles") else ("NoV", "phi")
+        return ("NoV",) if self.kind in ("gauss", "kinked", "polar", "hemisphere", "light-angles") else ("NoV", "phi")
 
     @property
     def components(self) -> int:
@@ -486,6 +495,8 @@ class Part:
         """
         count = len(self.view)
         read, out, ndf = count, [rows[:count]], None
+        if self.kinked:
+            out += self._edges(rows)
         for entry in self.slots.values():
             numbers = numbers_of(self.device, entry, rows[read : read + len(entry.parameters)])
             if entry.slot == "ndf" and entry.text is not None:
@@ -506,14 +517,39 @@ class Part:
             terms, error = table.length, table.error
         return np.concatenate(out), terms, error
 
+    def kinks(self, rows: np.ndarray) -> np.ndarray:
+        """Return the polar angles at which kinks want panels to meet, (k, n), NaN for none."""
+        found, read = [np.empty((0, rows.shape[1]))], len(self.view)
+        for entry in self.slots.values():
+            if entry.kinks:
+                own = {p.name: rows[read + k] for k, p in enumerate(entry.parameters)}
+                found.append(entry.kinks.angles(rows[0], **own))
+            read += len(entry.parameters)
+        return np.concatenate(found)
+
+    def _edges(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Return the polar angles at which panels meet, in their order, and their complements to π/2: (k, n) each."""
+        above = np.arctan2(rows[0], np.sqrt((1 - rows[0]) * (1 + rows[0])))
+        kinks, end = self.kinks(rows), np.pi / 2 - above / 2
+        # Where a panel of ring.clh ends, and the end of all for what lies beyond it.
+        edges = np.concatenate([kinks, above[None] / 2])
+        inside = (edges > 0) & (edges < end)
+        edges, rests = np.where(inside, edges, end), np.where(inside, np.pi / 2 - edges, above / 2)
+        order = np.argsort(edges, 0)
+        return [np.take_along_axis(some, order, 0) for some in (edges, rests)]
+
     @property
     def slow(self) -> float:
         """Largest ratio of a rule's error to its change from the rule before."""
-        return max(m.checks.slow_rules or 1.0 for m in self.slots.values())
+        return 1.0 if self.kinked else max(m.checks.slow_rules or 1.0 for m in self.slots.values())
 
     @property
     def ladder(self) -> tuple[Rule, ...]:
         """The rules of this part, from the coarsest to the finest."""
+        if self.kinked:
+            kinks = [entry.kinks for entry in self.slots.values() if entry.kinks]
+            panels = (1 + sum(k.on_ring for k in kinks)) * (2 + edge_count(self.slots) - 1)
+            return tuple(replace(rule, panels=panels) for rule in LADDERS[self.kind])
         return LADDERS[self.kind]
 
     def lanes(self, cells: np.ndarray) -> int:
@@ -522,7 +558,11 @@ class Part:
 
     def text(self, terms: int) -> str:
         """Return the kernel text for a table of Smith's area of `terms` terms."""
-        return (source.closed(self.closed, self.slots) if self.closed else _program(self.entry, self.slots, terms)).text
+        if self.closed:
+            return source.closed(self.closed, self.slots).text
+        if self.kinked:
+            return source.kinked(_integrand(self.entry), self.slots, edge_count(self.slots), terms).text
+        return _program(self.entry, self.slots, terms).text
 
     def sum(self, cells: np.ndarray, terms: int, rule: Rule, precision: int) -> np.ndarray:
         """Return the sums of one rule over cells: (components, n) in the working precision."""
@@ -532,8 +572,22 @@ class Part:
 def _program(entry: Integral, slots: Mapping[str, Model], terms: int) -> source.Source:
     """The kernel text of one summand of the BRDF."""
     if "ndf" in slots:
-        return source.integration(integral("albedo") if entry.name == "albedo_average" else entry, slots, terms)
+        return source.integration(_integrand(entry), slots, terms)
     return source.hemisphere(next(iter(slots.values())))
+
+
+def _integrand(entry: Integral) -> Integral:
+    """The integral whose kernel serves `entry`: an average is one of many albedos."""
+    return integral("albedo") if entry.name == "albedo_average" else entry
+
+
+def edge_count(slots: Mapping[str, Model]) -> int:
+    """Return the number of polar angles at which panels of models with kinks meet; 0 where no model has kinks."""
+    count = 0
+    for entry in slots.values():
+        if entry.kinks:
+            count += len(entry.kinks.angles(np.ones(1), **{p.name: np.array([p.low]) for p in entry.parameters}))
+    return count + 1 if count else 0
 
 
 def own_kernel_of(entry: Integral, slots: Mapping[str, Model]) -> str | None:
@@ -684,10 +738,24 @@ def _example(part: Part, rows: np.ndarray, values: np.ndarray) -> str:
     return ": " + ", ".join(f"{name} = {value:g}" for name, value in zip(names, rows[:, bad[0]], strict=True))
 
 
+def with_kinks(
+    part: Part, rows: np.ndarray, tolerance: float, totals: Totals, relative: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrate as `climb_with_errors` does, with panels that meet at the kinks in those cells that have some."""
+    if part.kind != "gauss" or part.entry.support != "HALF_ANGLE" or not edge_count(part.slots):
+        return climb_with_errors(part, rows, tolerance, totals, relative=relative)
+    kinked = np.isfinite(part.kinks(rows)).any(0)
+    values, errors = np.empty((part.components, rows.shape[1])), np.empty(rows.shape[1])
+    for some, how in ((kinked, replace(part, kinked=True)), (~kinked, part)):
+        if some.any():
+            values[:, some], errors[some] = climb_with_errors(how, rows[:, some], tolerance, totals, relative=relative)
+    return values, errors
+
+
 def _at_grazing(
     part: Part, rows: np.ndarray, tolerance: float, totals: Totals, relative: float = 0.0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate as `climb_with_errors` does, or by a kernel that is written for these models.
+    """Integrate as `with_kinks` does, or by a kernel that is written for these models.
 
     The value is infinite where a diffuse albedo is infinite at n·v = 0, as its closed form says (Minnaert's).
     """
@@ -703,7 +771,7 @@ def _at_grazing(
     along = np.flatnonzero(rows[0] == 0) if "diffuse" in part.slots else np.empty(0, int)
     closed = part.slots["diffuse"].reference.get("albedo") if along.size else None
     if closed is None:
-        return climb_with_errors(part, rows, tolerance, totals, relative=relative)
+        return with_kinks(part, rows, tolerance, totals, relative)
     own = {p.name: rows[1 + k, along] for k, p in enumerate(part.slots["diffuse"].parameters)}
     with np.errstate(all="ignore"):
         infinite = along[np.isinf(closed(rows[0, along], **own))]
@@ -730,7 +798,7 @@ def _average(
             many = np.repeat(rows, count, 1)
             many[0] = np.tile(x * x, rows.shape[1])
             inner = Totals()
-            E, off = climb_with_errors(part, many, tolerance / 2, inner, relative=relative / 2)
+            E, off = with_kinks(part, many, tolerance / 2, inner, relative / 2)
             totals.evaluations += inner.evaluations
             totals.promoted += inner.promoted
             totals.rule = inner.rule

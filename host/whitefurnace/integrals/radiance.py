@@ -35,6 +35,7 @@ from whitefurnace.integrals.quadrature import (
     slots_of,
     summands_of,
     tolerances,
+    with_kinks,
 )
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import finest, unique_rows
@@ -360,7 +361,7 @@ def _albedo(task: _Task, begin: int, end: int) -> tuple[np.ndarray, np.ndarray]:
         brdf = {slot: c for slot, c in task.slots.items() if slot != "light"}
         task.parts["albedo"] = parts_of(task.device, integral("albedo"), brdf, task.precision)
     found = [
-        climb_with_errors(part, task.grid.rows(part, begin, end), task.tolerance, task.totals, relative=task.relative)
+        with_kinks(part, task.grid.rows(part, begin, end), task.tolerance, task.totals, task.relative)
         for part in task.parts["albedo"]
     ]
     return np.asarray(sum(values for values, _ in found)), np.asarray(sum(errors for _, errors in found))

@@ -67,6 +67,9 @@ FUNCTIONS: Mapping[str, Function] = {
     "MASKING_V": Function("V", _PAIR_OF_DIRECTIONS),
     "MASKING_G": Function("G", _PAIR_OF_DIRECTIONS),
     "MASKING_G1": Function("G1", {"NoV": NUMBER, "at_v": NUMBER}),
+    "MASKING_KINK": Function("kink", {"NoV": NUMBER, "NoM": NUMBER}),
+    "MASKING_KINK_2": Function("kink_2", {"NoV": NUMBER, "NoM": NUMBER}),
+    "FRESNEL_KINK": Function("kink", {"NoV": NUMBER, "NoM": NUMBER}),
     "FRESNEL_F": Function("F", {"cos_d": NUMBER}),
     "DIFFUSE_F": Function("f", {"l": VECTOR, "v": VECTOR}),
     "BRDF_F": Function("f", {"l": VECTOR, "v": VECTOR}),
@@ -118,7 +121,8 @@ def bindings(slots: Mapping[str, Model], *, cells: Sequence[str] = ("NoV",), are
     ]
     for slot, entry in slots.items():
         lines += _list_lines(slot, entry, own, table)
-        for function in entry.provides:
+        kinks = [f"{slot.upper()}_KINK{end}" for end in ("", "_2")[: entry.kinks.on_ring if entry.kinks else 0]]
+        for function in (*entry.provides, *kinks):
             lines += _function_lines(slot, entry, function, isotropic)
     lines += _default_lines(slots, isotropic, bool(area_terms))
     lines += _cell_lines(cells, [name for slot in slots for name in own[slot]], table)

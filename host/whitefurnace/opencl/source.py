@@ -71,6 +71,17 @@ PROGRAMS: Mapping[str, Assembly] = {
         slots=_MICROFACETS,
         defines=("{support}",),
     ),
+    "integral with kinks": Assembly(
+        ("real.clh", *_MODELS, "facet.clh", "ring.clh", "integrand/{integral}.clh", "kinked.cl"),
+        slots=_MICROFACETS,
+        defines=(
+            "{support}",
+            "KINKS {kinks}",
+            "EDGES {edges}",
+            "CELL_EDGES {edge_names}",
+            "CELL_RESTS {rest_names}",
+        ),
+    ),
     "integral of an anisotropic NDF": Assembly(
         ("real.clh", *_MODELS, "facet.clh", "integrand/{integral}.clh", "stretched.cl"),
         slots=_MICROFACETS,
@@ -290,6 +301,28 @@ def integration(integral: Integral, slots: Mapping[str, Model], area_terms: int 
     """
     program = "integral" if slots["ndf"].isotropic else "integral of an anisotropic NDF"
     return assembled(program, slots, area_terms, integral=integral.name, support=integral.support)
+
+
+def kinked(integral: Integral, slots: Mapping[str, Model], edges: int, area_terms: int = 0) -> Source:
+    """Return the program of one integral over models with kinks.
+
+    edges: number of polar angles at which panels meet; a cell holds them after n·v, and then π/2 less each.
+    """
+    names = [[f"{kind}_{k}" for k in range(edges)] for kind in ("edge", "rest")]
+    listed = [", ".join(f"cell_{name}" for name in some) for some in names]
+    kinks = sum(entry.kinks.on_ring for entry in slots.values() if entry.kinks)
+    return assembled(
+        "integral with kinks",
+        slots,
+        area_terms,
+        cells=("NoV", *names[0], *names[1]),
+        integral=integral.name,
+        support=integral.support,
+        kinks=str(kinks),
+        edges=str(edges),
+        edge_names=listed[0],
+        rest_names=listed[1],
+    )
 
 
 def closed(file: str, slots: Mapping[str, Model]) -> Source:

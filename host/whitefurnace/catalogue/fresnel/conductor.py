@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from whitefurnace.catalogue.model import Model, Paper, Parameter
+from whitefurnace.catalogue.model import Kinks, Model, Paper, Parameter
+from whitefurnace.catalogue.numerics import critical_angles
 
 
 def _f(cos_d, eta, kappa):
@@ -13,6 +14,16 @@ def _f(cos_d, eta, kappa):
     tiny = 1e-300  # c = 0 and index 1: no boundary, no reflection
     r_s, r_p = (c - p) / (c + p + tiny), (index2 * c - p) / (index2 * c + p + tiny)
     return (np.abs(r_s) ** 2 + np.abs(r_p) ** 2) / 2
+
+
+def _angles(NoV, eta, kappa):
+    """Return the angles of the critical angle that a metal of nearly no extinction has: sin²θ = η² - κ².
+
+    Above κ = .1 no rule of integrals meets the root.
+    """
+    sine2 = np.asarray((eta - kappa) * (eta + kappa))
+    with np.errstate(invalid="ignore"):
+        return critical_angles(NoV, np.where((sine2 > 0) & (sine2 < 1) & (kappa <= 0.1), np.sqrt(sine2), np.nan))
 
 
 ENTRY = Model(
@@ -49,6 +60,7 @@ ENTRY = Model(
             np.where((kappa == 0) & (eta < 1), 1.0, np.nan),
         ),
     },
+    kinks=Kinks(1, _angles),
     notes={
         "at 0°": "((η - 1)² + κ²)/((η + 1)² + κ²)",
         "at 90°": "1, but 0 for η = 1, κ = 0",

@@ -3,7 +3,8 @@
 import numpy as np
 
 from whitefurnace.catalogue.bibliography import cited
-from whitefurnace.catalogue.model import Checks, Model, Parameter
+from whitefurnace.catalogue.model import Checks, Kinks, Model, Parameter
+from whitefurnace.catalogue.numerics import critical_angles
 
 
 def _f(cos_d, ior):
@@ -46,7 +47,8 @@ ENTRY = Model(
             np.where(ior < 1, 1.0, np.nan),
         ),
     },
-    # The root at the critical angle of n < 1: rules gain less on one another than they are off.
+    kinks=Kinks(1, lambda NoV, ior: critical_angles(NoV, np.where(ior < 1, ior, np.nan))),
+    # The root at the critical angle of n < 1: rules without a panel there gain less on one another than they are off.
     checks=Checks(slow_rules=6.0),
     notes={
         "at 0°": "((n - 1)/(n + 1))²",

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from whitefurnace.catalogue.model import Checks, Model, Paper
+from whitefurnace.catalogue.model import Checks, Kinks, Model, Paper
 
 
 def _v(NoV, NoL, NoH, VoH, at_v, at_l):
@@ -19,6 +19,24 @@ def _g(NoV, NoL, NoH, VoH, at_v, at_l):
     return np.where(NoL > 0, np.minimum(1.0, (NoL + NoV) * np.minimum(NoL, NoV) / np.square(VoH)), 0.0)
 
 
+def _angles(NoV):
+    """Return the angles at which the terms of G cross in the plane of incidence, and 45°, where all three cross.
+
+    2(n·h)(n·v) = v·h there for tan θ tan θv = 1, and 2(n·h)(n·l) = v·h for tan θ tan(2θ ∓ θv) = 1. Beyond 45° only
+    n·l = n·v counts.
+    """
+    view = np.arccos(np.asarray(NoV, np.float64))
+    steep = view > np.pi / 4
+    return np.stack(
+        [
+            np.full_like(view, np.pi / 4),
+            (np.pi / 2 - view) / 3,
+            np.where(steep, np.pi / 2 - view, (np.pi / 2 + view) / 3),
+            np.where(steep, view, np.nan),
+        ]
+    )
+
+
 ENTRY = Model(
     slot="masking",
     name="cook_torrance",
@@ -30,6 +48,7 @@ ENTRY = Model(
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
     # Kinks where the grooves begin to mask: a rule's error is up to this many times its change from the one before.
+    kinks=Kinks(2, _angles),
     checks=Checks(reciprocal=True, slow_rules=32.0),
     notes={"follows roughness": False},
 )

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from whitefurnace.catalogue.model import Checks, Model, Paper
+from whitefurnace.catalogue.model import Checks, Kinks, Model, Paper
 
 
 def _g(NoV, NoL, NoH, VoH, at_v, at_l):
@@ -13,6 +13,11 @@ def _v(NoV, NoL, NoH, VoH, at_v, at_l):
     """min(1/(n·l), 1/(n·v)), infinite where both graze."""
     with np.errstate(divide="ignore"):
         return np.where(np.asarray(NoL) > 0, np.minimum(1 / np.abs(NoL), 1 / np.asarray(NoV, np.float64)), 0.0)
+
+
+def _angles(NoV):
+    """Return θv: only the rings within it have directions with n·l = n·v."""
+    return np.arccos(np.asarray(NoV, np.float64))[None]
 
 
 ENTRY = Model(
@@ -26,6 +31,7 @@ ENTRY = Model(
     provides=("MASKING_AT", "MASKING_V", "MASKING_G"),
     reference={"V": _v, "G": _g},
     # A kink at n·l = n·v: the error of a rule is up to this many times its change from the one before.
+    kinks=Kinks(1, _angles),
     checks=Checks(reciprocal=True, slow_rules=16.0),
     notes={"follows roughness": False},
 )
