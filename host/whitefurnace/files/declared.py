@@ -52,7 +52,6 @@ def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Decla
     spec: OpenImageIO's description. form: OpenImageIO's name of the format. notices: gets sentences about statements
     that are not applied. Raises `InputError` for a statement that is not supported and changes the values.
     """
-    _check_aspect(spec, path)
     check_panorama(spec, path, notices)
     channels = 3 if spec.nchannels >= 3 else 1
     associated = inverted = False
@@ -77,17 +76,6 @@ def read_declared(path: Path, form: str, spec: Any, notices: list[str]) -> Decla
             _check_jpeg2000(path)
         encoding = _by_attributes(spec, form, path, channels)
     return Declared(encoding, associated, inverted)
-
-
-def _check_aspect(spec: Any, path: Path) -> None:
-    aspect = float(spec.get_float_attribute("PixelAspectRatio", 0.0))
-    x, y = (float(spec.get_float_attribute(f"{axis}Resolution", 0.0)) for axis in "XY")
-    if aspect == 0 and x > 0 and y > 0:
-        aspect = y / x
-    if aspect > 0 and not 0.99 < aspect < 1.01:
-        raise InputError(
-            f"{path} states pixels of the aspect ratio {aspect:.4g}; square pixels were expected, or no resolution"
-        )
 
 
 def from_chromaticities(primaries: Sequence[float] | None, path: Path) -> Encoding | None:

@@ -34,6 +34,7 @@ class Radiance:
     notices        sentences about the statements of the header
     start          offset of the pixels; `lines` and `length`: the number of scanlines, and of texels in each
     order          the resolution string, such as "-Y 64 +X 128"
+    aspect         width of a pixel over its height
     plain          True if rows run from the top and from the left, and lines end as on Unix
     """
 
@@ -46,6 +47,7 @@ class Radiance:
     length: int
     order: str
     plain: bool
+    aspect: float
 
     def rewrite(self, path: Path, copy: Path, flat: bytes | None) -> None:
         """Write the pixels of `path`, or these flat ones, with a header in which scanlines are rows from the top."""
@@ -116,7 +118,7 @@ def read_radiance_header(path: Path) -> Radiance:
     width, height = (first, second) if found[2] == b"X" else (second, first)
     order = f"{found[1].decode()}{found[2].decode()} {first} {found[4].decode()}{found[5].decode()} {second}"
     plain = order == f"-Y {first} +X {second}" and b"\r" not in head[: stop + 1]
-    return Radiance(width, height, encoding, notices, stop + 1, first, second, order, plain)
+    return Radiance(width, height, encoding, notices, stop + 1, first, second, order, plain, _aspect(lines, path))
 
 
 def _check_format(lines: list[bytes], path: Path) -> None:
@@ -133,7 +135,7 @@ def _check_format(lines: list[bytes], path: Path) -> None:
 
 def _encoding(lines: list[bytes], path: Path) -> tuple[Encoding | None, tuple[str, ...]]:
     """Multiply up the cumulative variables. Lines that begin with a blank tell of other pictures."""
-    exposure, aspect, gamma = 1.0, 1.0, 1.0
+    exposure = gamma = 1.0
     correction = np.ones(3)
     primaries: tuple[float, ...] | None = None
     for line in lines:
@@ -142,14 +144,10 @@ def _encoding(lines: list[bytes], path: Path) -> tuple[Encoding | None, tuple[st
             exposure *= _numbers(value, 1, "EXPOSURE", path)[0]
         elif name == b"COLORCORR":
             correction = correction * _numbers(value, 3, "COLORCORR", path)
-        elif name == b"PIXASPECT":
-            aspect *= _numbers(value, 1, "PIXASPECT", path)[0]
         elif name == b"GAMMA":
             gamma *= _numbers(value, 1, "GAMMA", path)[0]
         elif name == b"PRIMARIES":
             primaries = _numbers(value, 8, "PRIMARIES", path)
-    if not 0.99 < aspect < 1.01:
-        raise InputError(f"{path} states pixels {aspect:g} times as high as wide (PIXASPECT), square ones are read")
     scale = exposure * correction
     if not (np.all(np.isfinite(scale)) and np.all(scale > 0) and 0.01 <= gamma <= 100):
         raise InputError(f"{path} states a product of EXPOSURE, COLORCORR or GAMMA that is out of range")
@@ -174,6 +172,17 @@ def _encoding(lines: list[bytes], path: Path) -> tuple[Encoding | None, tuple[st
     linear = gamma == 1 and bool(np.all(scale == 1))
     curves = (LINEAR,) if linear else tuple(_scaled(gamma, float(factor)) for factor in scale)
     return Encoding(curves, "", matrix), tuple(notices)
+
+
+def _aspect(lines: list[bytes], path: Path) -> float:
+    """Return the width of a pixel over its height by all lines PIXASPECT, which state the inverse; 1 if within 1 %."""
+    product = 1.0
+    for line in lines:
+        if line.startswith(b"PIXASPECT="):
+            product *= _numbers(line[10:], 1, "PIXASPECT", path)[0]
+    if not 1e-6 < product < 1e6:
+        raise InputError(f"{path} states a pixel aspect ratio of {product:g} (PIXASPECT), which is out of range")
+    return 1.0 if 0.99 < product < 1.01 else 1 / product
 
 
 def _scaled(gamma: float, scale: float) -> Curve:

@@ -60,7 +60,7 @@ class Image:
     format   OpenImageIO's name of the file format
     notices  sentences about conversions and about data that was left out
     layout   the layout that the file itself states, "latlong" or "openexr cube"; None where it states none
-    aspect   width of a pixel over its height, as an OpenEXR file states it; others must have square pixels
+    aspect   width of a pixel over its height, as the file states it
     largest  the largest finite value that the file's pixels can hold
     """
 
@@ -165,6 +165,18 @@ class Opened:
             return self.radiance.width, self.radiance.height
         width, height = self.spec.full_width, self.spec.full_height
         return (height, width) if 5 <= self.orientation <= 8 else (width, height)
+
+    @property
+    def aspect(self) -> float:
+        """Width of a pixel over its height, as the file states it; 1 where it states none, or one within 1 %."""
+        if self.choice is not None:
+            return self.choice.aspect
+        if self.radiance is not None:
+            return self.radiance.aspect
+        # Resolutions first: of a JPEG, OpenImageIO's ratio is the inverse.
+        x, y = (float(self.spec.get_float_attribute(f"{axis}Resolution", 0.0)) for axis in "XY")
+        aspect = y / x if x > 0 and y > 0 else float(self.spec.get_float_attribute("PixelAspectRatio", 0.0))
+        return aspect if aspect > 0 and not 0.99 < aspect < 1.01 else 1.0
 
     @property
     def orientation(self) -> int:
@@ -302,8 +314,8 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
             )
         pixels = _upright(pixels, found.orientation)
     if choice is not None:
-        return Image(pixels, path, digest, form, tuple(notices), choice.layout, choice.aspect, choice.largest)
-    return Image(pixels, path, digest, form, tuple(notices), largest=largest)
+        return Image(pixels, path, digest, form, tuple(notices), choice.layout, found.aspect, choice.largest)
+    return Image(pixels, path, digest, form, tuple(notices), aspect=found.aspect, largest=largest)
 
 
 def _radiance(

@@ -27,7 +27,7 @@ class ImageFacts:
 
     format       OpenImageIO's name of the file format
     layout       the layout that the file itself states, "latlong" or "openexr cube"; None where it states none
-    aspect       width of a pixel over its height, as an OpenEXR file states it
+    aspect       width of a pixel over its height, as the file states it
     pixel        type of a value, such as "half" or "uint8"
     compression  its name, empty where there is none
     attributes   the attributes that this package wrote, without their prefix
@@ -104,7 +104,7 @@ def _opened(
                     spec.get_string_attribute("compression"),
                     own,
                     None if choice is None else choice.layout,
-                    1.0 if choice is None else choice.aspect,
+                    found.aspect,
                 ),
             )
     except OSError as error:

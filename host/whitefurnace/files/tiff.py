@@ -47,7 +47,7 @@ class Tiff:
 
 
 _WANTED = {_SUBFILE, _OLD_SUBFILE, _BITS, _PHOTOMETRIC, _COLOR_MAP, WHITE, PRIMARIES} | {
-    *(282, 283, 290, 291, 301, 338, 339, 532, 34675)
+    *(290, 291, 301, 338, 339, 532, 34675)
 }
 
 
@@ -121,11 +121,6 @@ def _check_samples(tags: dict[int, Values], path: Path) -> None:
             raise InputError(
                 f"{path} states black and white as the codes {shown} (ReferenceBlackWhite), 0 and {top:g} are"
             )
-    x, y = (tags.get(tag, (1,))[:1] for tag in (282, 283))
-    if x and y and x[0] > 0 and y[0] > 0 and not 0.99 < x[0] / y[0] < 1.01:
-        raise InputError(
-            f"{path} states {x[0]:g} x {y[0]:g} pixels a unit of length; square pixels were expected, or no resolution"
-        )
 
 
 def _encoding(tags: dict[int, Values], file: mmap.mmap, path: Path) -> Encoding | None:

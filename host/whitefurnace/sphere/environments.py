@@ -417,6 +417,8 @@ def _from_six(source: Path, paths: list[Path], name: str, reading: Reading) -> E
                 f"{path} is {width} x {height}, but the six faces must be squares of one size"
                 + (f", here {size} x {size}" if width == height else "")
             )
+        if image.aspect != 1:
+            raise InputError(f"{path} states a pixel aspect ratio of {image.aspect:g}, pixels of cube faces are square")
         notices += image.notices
         images.append(image)
     channels = 4 if any(image.pixels.shape[2] == 4 for image in images) else 3

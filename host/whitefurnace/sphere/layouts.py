@@ -119,6 +119,9 @@ def layout_of(
     file. Raises `InputError` for a size that the layout cannot have, or that no layout has.
     """
     height, width = shape[:2]
+    square = abs(aspect - 1) <= 1e-3  # not so for NaN; the rounding of ratios in files is smaller
+    if not square and (asked is not None or stated is not None):
+        notices.append(f"{where}: states a pixel aspect ratio of {aspect:g}, which a layout does not need")
     if asked is not None:
         layout = _asked(height, width, where, asked.replace(" ", "-"), notices)
         if stated not in (None, layout.name):
@@ -134,7 +137,7 @@ def layout_of(
         how = "with OpenEXR's order and axes of its six faces" if layout.cells else "with +X in its middle"
         notices.append(f"{where}: read as {stated}, as its envmap attribute says, {how}")
         return layout
-    if not abs(aspect - 1) <= 1e-3:  # not so for NaN; the rounding of ratios in files is smaller
+    if not square:
         raise InputError(
             f"{where} states a pixel aspect ratio of {aspect:g}, pixels of environments are square; --layout NAME "
             "reads it all the same"
