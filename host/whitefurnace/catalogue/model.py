@@ -135,7 +135,7 @@ class Model:
     there, NaN where there is none.
     text, path, function, takes_sin2: for a model from a user's file, its text translated for kernels (`user_text`), the
     path of the file, the name of its function, and whether its D takes sin²θ. Models of the catalogue have a kernel
-    file instead.
+    file instead; a text without `function` stands for that file.
     """
 
     slot: str

@@ -149,7 +149,7 @@ def _function_lines(slot: str, entry: Model, function: str, isotropic: bool) -> 
     known = FUNCTIONS[function]
     dummies = [f"a{k}" for k in range(len(known.kinds(isotropic)))]
     passed = dummies[:1] if function == "NDF_D" and not entry.takes_sin2 else dummies
-    target = f"{slot}_{entry.name}_{known.ending}" if entry.text is None else f"lanes_{slot}"
+    target = f"lanes_{slot}" if entry.function else f"{slot}_{entry.name}_{known.ending}"
     if slot in SELF_CONTAINED:
         call = f"{target}({', '.join([*passed, *(f'{slot}_{n}' for n in entry.passed(function))])})"
     else:

@@ -257,9 +257,11 @@ def assembled(
             for entry in bound.values():
                 if entry.text is None:
                     add(entry.kernel_file, _file(entry.kernel_file))
-                else:
+                    continue
+                if entry.function:
                     add("user.clh", _file("user.clh"))
-                    add(MARK + (entry.path or entry.name), entry.text)
+                add(MARK + (entry.path or entry.name), entry.text)
+                if entry.function:
                     add("lanes", lanes(entry))
         else:
             add(name, _CONSTANTS[name]() if name in _CONSTANTS else texts[name])
