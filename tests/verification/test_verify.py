@@ -325,7 +325,7 @@ def test_specs(files: Path, tmp_path: Path) -> None:
         subjects([f"{files}/white.clh"])
     with pytest.raises(InputError, match=r"ndf_neither_D.*brdf_neither_f"):
         subjects([f"{files}/neither.clh"])
-    with pytest.raises(FileError, match="cannot be read"):
+    with pytest.raises(FileError, match="cannot read"):
         subjects([str(tmp_path / "none.clh")])
     with pytest.raises(UsageError, match="masking implicit has no parameter 'k'; there is none"):
         subjects(["implicit:k=1"])
