@@ -492,8 +492,9 @@ def test_depths_palettes_and_interlacing(tmp_path):
         ("transparent", noise.quantize(8), {"transparency": 3}),
         ("grey", noise.convert("L"), {}),
         ("rgba", noise.convert("RGBA"), {}),
+        ("gif", noise.quantize(64), {}),
     ):
-        path = tmp_path / f"{name}.png"
+        path = tmp_path / (f"{name}.gif" if name == "gif" else f"{name}.png")
         picture.save(path, **options)
         image = read_image(path).pixels
         mode = {1: "L", 3: "RGB", 4: "RGBA"}[image.shape[2]]

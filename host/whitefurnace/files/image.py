@@ -299,8 +299,10 @@ def _decode(found: Opened, path: Path, digest: str) -> Image:
     else:
         declared = read_declared(path, form, spec, notices)
     # TIFF, PNG and WebP are looked at in `declared`; others have one image, or the whole one first.
-    if form in ("gif", "jpegxl") and source.seek_subimage(1, 0):
-        raise InputError(f"{path} holds several images or frames, a single one was expected")
+    if form in ("gif", "jpegxl"):
+        if source.seek_subimage(1, 0):
+            raise InputError(f"{path} holds several images or frames, a single one was expected")
+        source.seek_subimage(0, 0)  # a GIF reader stands at no image after it has looked for a second one
     _complaint(source)
     if choice is None and int(spec.get_int_attribute("oiio:subimages", 1)) > 1:
         notices.append(f"{path}: only the first of its {spec.get_int_attribute('oiio:subimages')} images was read")
