@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import InputError
+from whitefurnace.files import memory
 from whitefurnace.files.binary import MAX_BYTES, Source, load
 from whitefurnace.files.inputs import head_of, read_text
 
@@ -66,7 +67,7 @@ def read_npy(path: str | os.PathLike[str]) -> npt.NDArray[Any]:
     import io
 
     source = load(path)
-    return _array(cast(BinaryIO, io.BytesIO(source.view)), len(source), source, "it")
+    return _array(cast(BinaryIO, io.BytesIO(source.view)), len(source), source, "it", len(source))
 
 
 def read_npz(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
@@ -81,14 +82,18 @@ def read_npz(path: str | os.PathLike[str]) -> dict[str, npt.NDArray[Any]]:
     try:
         with zipfile.ZipFile(io.BytesIO(source.view)) as archive:
             members = archive.infolist()
-            if sum(member.file_size for member in members) > min(MAX_BYTES, _DENSEST * len(source)):
+            total = sum(member.file_size for member in members)
+            if total > min(MAX_BYTES, _DENSEST * len(source)):
                 raise source.wrong("its directory says that it holds more than its bytes can")
+            memory.require(len(source) + total, "its arrays", source.name, len(source))
             for member in members:
                 name = member.filename.removesuffix(".npy")
                 if name in found:
                     raise source.wrong(f"it holds {name!r} twice")
                 with archive.open(member) as stream:
-                    found[name] = _array(cast(BinaryIO, stream), member.file_size, source, f"its member {name!r}")
+                    found[name] = _array(
+                        cast(BinaryIO, stream), member.file_size, source, f"its member {name!r}", total
+                    )
                     if stream.read(1):
                         raise source.wrong(f"its member {name!r} is longer than its header says")
     except InputError:
@@ -112,6 +117,7 @@ def read_header(path: str | os.PathLike[str]) -> npt.NDArray[np.float64] | None:
         raise source.wrong("it is no C header: it has neither an array of floats nor a macro")
     shape = tuple(int(size) for size in found[1].strip("[]").split("]["))
     body, end, _ = text[found.end() :].partition("};")
+    memory.require(3 * len(text) + 200 * body.count(","), "its numbers", source.name, len(text))
     numbers = _NUMBER.findall(body)
     if not end or math.prod(shape) != len(numbers):
         raise source.wrong(f"it says that it has {math.prod(shape)} numbers, {len(numbers)} are there")
@@ -124,8 +130,11 @@ def is_arrays(path: str | os.PathLike[str]) -> bool:
     return head == NPY or (head.startswith(ZIP) and Path(path).suffix.lower() == ".npz")
 
 
-def _array(stream: BinaryIO, size: int, source: Source, what: str) -> npt.NDArray[Any]:
-    """Parse the array in a stream of `size` bytes; `what` names the stream in error messages."""
+def _array(stream: BinaryIO, size: int, source: Source, what: str, total: int) -> npt.NDArray[Any]:
+    """Parse the array in a stream of `size` bytes; `what` names the stream in error messages.
+
+    total: bytes of all arrays of the file.
+    """
     try:
         version = np.lib.format.read_magic(stream)
         if version not in _READERS:
@@ -141,6 +150,8 @@ def _array(stream: BinaryIO, size: int, source: Source, what: str) -> npt.NDArra
     wanted = math.prod(shape) * dtype.itemsize
     if wanted != size - start:
         raise source.wrong(f"{what} says that it has {wanted} bytes of numbers, {size - start} are there")
+    # The values are read as float32 later, one array at a time.
+    memory.require(len(source) + total + 4 * math.prod(shape), f"the numbers of {what}", source.name, len(source))
     try:
         flat = np.frombuffer(stream.read(wanted), dtype)
         return flat.reshape(shape, order="F" if fortran else "C")

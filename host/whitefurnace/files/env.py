@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from whitefurnace.files import memory
 from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import Source, load
 from whitefurnace.files.jsontext import Reader, parse_object
@@ -22,6 +23,9 @@ MAGIC = bytes((0x86, 0x16, 0x87, 0x96, 0xF6, 0xD6, 0x96, 0x36))
 VERSION = 2
 POLYNOMIALS = ("x", "y", "z", "xx", "yy", "zz", "yz", "zx", "xy")
 LOD_SCALE = 0.8
+LEAST_SCALE, MOST_SCALE = 0.05, 20.0
+"""Range of the scale of lod by roughness that is read. Babylon.js writes 0.8 always."""
+
 _MAX_MANIFEST = 1 << 20
 _IMAGE_TYPES = ("image/png", "image/webp")
 
@@ -143,6 +147,8 @@ def parse_env(source: Source) -> EnvMap:
     count = width.bit_length()
     spans = _spans(take, specular.get("mipmaps"), "specular.mipmaps", 6 * count, start)
     scale = take.number(specular.get("lodGenerationScale") or LOD_SCALE, "lodGenerationScale")  # as `||` in JavaScript
+    if not LEAST_SCALE <= scale <= MOST_SCALE:
+        raise source.wrong(f"its lodGenerationScale is {scale:g}, {LEAST_SCALE:g} to {MOST_SCALE:g} is read")
 
     light = take.object(manifest.get("irradiance") or {}, "irradiance")
     polynomials = None
@@ -163,13 +169,21 @@ def parse_env(source: Source) -> EnvMap:
         if first + bytes_there > second:  # else a small file could unpack to any size
             raise source.wrong(f"its images overlap at byte {second}, each must have bytes of its own")
 
-    sides = [width >> k // 6 for k in range(6 * count)] + [side] * 6
-    faces = []
-    for k, (at, size) in enumerate(spans):
-        name = f"face {k % 6} of " + (f"mip {k // 6}" if k < 6 * count else "irradianceTexture")
-        piece = Source(source.piece(at, size, name), f"{source.name}, {name},")
-        faces.append(decode_face(piece, sides[k]))
-    cubes = [np.stack(faces[k : k + 6]) for k in range(0, len(faces), 6)]
+    sides = [width >> k for k in range(count)] + [side] * (side > 0)
+    texels = sum(6 * n * n for n in sides)
+    most = max(sides) ** 2
+    # All cubes as floats, the six faces of one besides, and the codes of one face as they are decoded.
+    memory.require(
+        len(source) + 12 * texels + 72 * most + 12 * most, f"its {texels} texels as floats", source.name, len(source)
+    )
+    cubes = []
+    for k, n in enumerate(sides):
+        mip = f"mip {k}" if k < count else "irradianceTexture"
+        faces = [
+            decode_face(Source(source.piece(*span, mip), f"{source.name}, face {face} of {mip},"), n)
+            for face, span in enumerate(spans[6 * k : 6 * k + 6])
+        ]
+        cubes.append(np.stack(faces))
     return EnvMap(
         tuple(cubes[:count]), polynomials, cubes[count] if side else None, scale, dominant, version, image_type
     )

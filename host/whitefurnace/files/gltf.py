@@ -16,8 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import FileError, InputError
-from whitefurnace.files.binary import Source, load
-from whitefurnace.files.gltf_lights import GLB_MAGIC, _document, _Images
+from whitefurnace.files.binary import load
+from whitefurnace.files.gltf_lights import _document, _Images
 from whitefurnace.files.image import MAX_PIXELS, _check_size, _complaint, _reason
 from whitefurnace.files.inputs import head_of, plain_name
 from whitefurnace.files.integrity import check_file
@@ -52,7 +52,6 @@ class Gltf:
         self.path = Path(path)
         self.source = load(path)
         self.take = Reader(self.source)
-        _check_amount(self.source)
         self.document, binary = _document(self.source)
         asset = self.take.object(self.document.get("asset"), "asset")
         version = self.take.text(asset.get("version"), "asset.version")
@@ -165,19 +164,6 @@ class Gltf:
                 raise InputError(str(error).replace(str(path), name)) from None
             except MemoryError:
                 raise InputError(f"{name} needs more memory than this machine gives") from None
-
-
-def _check_amount(source: Source) -> None:
-    """Refuse JSON with more values than fit in memory as Python objects."""
-    view = source.view
-    if bytes(view[:4]) == GLB_MAGIC and len(view) >= 20:
-        view = view[20 : 20 + int.from_bytes(view[12:16], "little")]
-    count = 0
-    for at in range(0, len(view), 1 << 24):
-        piece = bytes(view[at : at + (1 << 24)])
-        count += sum(piece.count(mark) for mark in (b",", b"[", b"{"))
-    if count > MAX_VALUES:
-        raise source.wrong(f"its JSON has about {count} values, a scene has at most {MAX_VALUES}")
 
 
 def _decoded(path: Path, size: int) -> Iterator[tuple[int, int, int, Codes]]:

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import WhitefurnaceError
+from whitefurnace.files import memory
 from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import MAX_BYTES, Source, load
 from whitefurnace.files.inputs import inside, plain_name
@@ -139,6 +140,8 @@ def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfL
     texels = sum(6 * (size >> mip) ** 2 for _, size, mips in entries for mip in range(len(mips)))
     if 12 * texels > MAX_BYTES:
         raise source.wrong(f"its lights have {12 * texels} bytes of texels, at most {MAX_BYTES} are allowed")
+    # Faces are kept while the lights are made, since several may name one image.
+    memory.require(3 * len(source) + 24 * texels, f"its {texels} texels as floats", source.name, len(source))
     lights = []
     for k, (light, size, mips) in enumerate(entries):
         what = f"light {k}"

@@ -12,11 +12,32 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from whitefurnace.files import memory
 from whitefurnace.files.binary import Source
+
+MAX_VALUES = 4_000_000
+"""Largest number of values in the JSON of a file, counted by commas and brackets: some hundred megabytes in Python."""
+
+VALUE_BYTES = 120
+"""Memory of a value in Python at most, on average: a number with its place in a list, or a short text."""
+
+
+def value_count(text: str | bytes) -> int:
+    """Return about the number of values in a JSON text, without parsing it."""
+    marks = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
+    return sum(text.count(mark) for mark in marks)  # type: ignore[arg-type]
 
 
 def parse_object(source: Source, text: str, what: str) -> dict[str, Any]:
-    """Parse the JSON object in `text`; `what` names it in error messages. Raises `InputError`."""
+    """Parse the JSON object in `text`; `what` names it in error messages.
+
+    Raises `InputError` also for more than 4 000 000 values, and for more memory than the file may take.
+    """
+    count = value_count(text)
+    if count > MAX_VALUES:
+        raise source.wrong(f"{what} has about {count} values, at most {MAX_VALUES} are read")
+    # The text is there once as bytes, once as characters, and once in the parsed values.
+    memory.require(3 * len(text) + VALUE_BYTES * count, f"the values of {what}", source.name, len(source))
     try:
         found = json.loads(text)
     except (ValueError, RecursionError) as error:  # a number of too many digits is a ValueError too

@@ -12,9 +12,10 @@ import msgspec
 
 from whitefurnace.files.atomic import Transaction, write_atomic
 from whitefurnace.files.inputs import input_size, is_input, read_input
+from whitefurnace.files.jsontext import value_count
 
-# A manifest lists a few files; a larger file is not ours.
-_MAX_BYTES = 64 << 20
+# A manifest lists a few files; a larger file, or one with more values, is not ours.
+_MAX_BYTES, _MAX_VALUES = 64 << 20, 1 << 20
 
 
 def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
@@ -27,7 +28,10 @@ def read_manifest(path: str | os.PathLike[str]) -> dict[str, Any] | None:
     try:
         if not is_input(path) or input_size(path) > _MAX_BYTES:
             return None
-        found = json.loads(read_input(path, "a manifest", most=_MAX_BYTES))
+        text = read_input(path, "a manifest", most=_MAX_BYTES)
+        if value_count(text) > _MAX_VALUES:
+            return None
+        found = json.loads(text)
     except (ValueError, RecursionError):  # not UTF-8, not JSON, or nested without end
         return None
     return found if isinstance(found, dict) and "whitefurnace" in found else None

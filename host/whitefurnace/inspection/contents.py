@@ -491,18 +491,28 @@ def _kind_of(shape: tuple[int, ...]) -> str:
     return "table"
 
 
-def _floats(path: Path, array: np.ndarray, kind: str) -> np.ndarray:
-    """Return the array as float32 with a channel axis; tables of more than two axes become rows of the last two."""
+def _floats(path: Path, array: np.ndarray, kind: str) -> Deferred:
+    """Return the array as float32 with a channel axis, converted when it is asked for.
+
+    Tables of more than two axes become rows of the last two. Raises InputError for an array without a value.
+    """
     if array.size == 0:
         raise InputError(f"{path} is not valid: it holds an array of {array.shape}, without a value")
-    with np.errstate(over="ignore"):
-        found = np.array(array, np.float32, order="C")
     if kind in ("cube", "irradiance", "lat-long", "dfg"):
-        return found
-    if found.ndim <= 2:
-        return found.reshape(1 if found.ndim < 2 else found.shape[0], -1, 1)
-    small = found.shape[-1] <= 4
-    return found.reshape(-1, *found.shape[-2:]) if small else found.reshape(-1, found.shape[-1], 1)
+        shape = array.shape
+    elif array.ndim <= 2:
+        rows = array.shape[0] if array.ndim == 2 else 1
+        shape = (rows, array.size // rows, 1)
+    elif array.shape[-1] <= 4:
+        shape = (array.size // (array.shape[-2] * array.shape[-1]), *array.shape[-2:])
+    else:
+        shape = (array.size // array.shape[-1], array.shape[-1], 1)
+
+    def converted() -> np.ndarray:
+        with np.errstate(over="ignore"):
+            return np.array(array, np.float32, order="C").reshape(shape)
+
+    return Deferred(shape, converted)
 
 
 # ------------------------------------------------------------------------------------------------- statements
