@@ -1,15 +1,20 @@
-"""Structured mutations of image files for the fuzz test: the container stays whole, what it states does not.
+"""Structured mutations of images, textures and arrays: the container stays whole, what it states does not.
 
 Checksums, offsets and lengths are right, so that a mutated file reaches the code behind them.
 """
 
 from __future__ import annotations
 
+import io
+import math
 import random
 import struct
+import warnings
+import zipfile
 import zlib
 
 from changed_values import changed_env, changed_json
+from whitefurnace.files.zstd import compress
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
@@ -286,7 +291,151 @@ def webp(data: bytes, rng: random.Random) -> bytes:
     return b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body
 
 
+# --- textures and arrays ---------------------------------------------------------------------------------
+
+
+def _words(*values: int) -> bytes:
+    return struct.pack(f"<{len(values)}I", *values)
+
+
+def _pairs(rng: random.Random) -> bytes:
+    """Key-values of KTX with sizes that are right: those that a reader applies, and others."""
+    out = b""
+    for _ in range(rng.randrange(4)):
+        key = rng.choice(
+            (
+                *(b"KTXorientation", b"KTXswizzle", b"KTXmapRange", b"KTXcubemapIncomplete", b"KTXanimData", b"sh"),
+                *(b"roughness", b"whitefurnace:error", b"whitefurnace:engine", b"\xff", b"x" * 300),
+            )
+        )
+        value = rng.choice(
+            (
+                *(b"rd\0", b"ru\0", b"S=r,T=d\0", b"S=r,T=u\0", b"bgra\0", b"rrr1\0", b"0000\0", b"rgbx\0", b""),
+                struct.pack("<2f", rng.choice((1, 0, -2, 1e30, math.inf, math.nan)), rng.uniform(-1, 1)),
+                b" ".join(rng.choice((b"0.5", b"nan", b"1e999", b"x")) for _ in range(rng.choice((3, 27, 28)))) + b"\0",
+                rng.randbytes(rng.randrange(12)),
+            )
+        )
+        pair = key + b"\0" + value
+        out += _words(len(pair)) + pair + bytes(-len(pair) % 4)
+    return out
+
+
+def ktx1(data: bytes, rng: random.Random) -> bytes:
+    """Another header for the same levels: types and formats of GL that fit each other or not, other key-values."""
+    head = list(struct.unpack_from("<13I", data, 12))
+    body = data[64 + head[12] :]
+    if rng.random() < 0.5:
+        head[1:5] = rng.choice(
+            (
+                *((0x1401, 1, 0x1908, 0x8058), (0x1401, 1, 0x80E1, 0x8C43), (0x1406, 4, 0x1903, 0x822E)),
+                *((0x8C3B, 4, 0x1907, 0x8C3A), (0x8C3E, 4, 0x1907, 0x8C3D), (0x140B, 2, 0x8227, 0x8C3A)),
+                *((0, 1, 0, 0x8D64), (0, 1, 0, 0x8E8F), (0x1403, 2, 0x1907, 0x1907)),
+            )
+        )
+    for _ in range(rng.choice((0, 1, 1, 2))):
+        head[rng.randrange(1, 12)] = rng.choice((0, 1, 2, 4, 6, 0x1907, 0x8C3A, 2048, 65536, _number(rng)))
+    keys = _pairs(rng)
+    head[12] = len(keys)
+    if rng.random() < 0.2:
+        return data[:12] + struct.pack(">13I", *head) + keys + body
+    return data[:12] + _words(*head) + keys + body
+
+
+def ktx2(data: bytes, rng: random.Random) -> bytes:
+    """Another header, descriptor, key-values or packing of the levels, with offsets and lengths that are right."""
+    head = list(struct.unpack_from("<13I2Q", data, 12))
+    count = max(head[7], 1)
+    index = [list(struct.unpack_from("<3Q", data, 80 + 24 * k)) for k in range(count)]
+    levels = [data[at : at + length] for at, length, _ in index]
+    descriptor = bytearray(data[head[9] : head[9] + head[10]])
+    if rng.random() < 0.4:
+        at = rng.choice((12, 13, 14, 15, 16, 17, 20, rng.randrange(len(descriptor))))
+        descriptor[at] = rng.choice((0, 1, 2, 4, 10, 11, 16, 18, 133, 163, 255, rng.randrange(256)))
+    if rng.random() < 0.3:
+        head[0] = rng.choice(
+            (0, 9, 23, 30, 37, 43, 50, 83, 97, 106, 109, 122, 123, 143, 146, 152, 1000066000, _number(rng))
+        )
+    for _ in range(rng.choice((0, 0, 1, 2))):
+        head[rng.randrange(1, 9)] = rng.choice((0, 1, 2, 3, 4, 6, 2048, 65536, _number(rng)))
+    if rng.random() < 0.4:
+        scheme = rng.choice((2, 3))
+        pack = zlib.compress if scheme == 3 else lambda part: compress(part, 1)
+        raw = [bytes(unpacked) if unpacked < 1 << 16 else b"" for _, _, unpacked in index]
+        levels = [pack(part if rng.random() < 0.9 else part + b"x") for part in raw]
+        head[8] = scheme if rng.random() < 0.9 else rng.choice((0, 2, 3))
+    keys = _pairs(rng)
+    at = 80 + 24 * count
+    head[9:13] = [at, len(descriptor), at + len(descriptor), len(keys)]
+    at += len(descriptor) + len(keys)
+    table, body = b"", b""
+    for (_, _, unpacked), level in zip(index, levels, strict=True):
+        if rng.random() < 0.05:
+            unpacked = rng.choice((0, unpacked * 2, 1 << 40, (1 << 64) - 1))
+        table += struct.pack("<3Q", at + len(body), len(level), unpacked)
+        body += level
+    return data[:12] + struct.pack("<13I2Q", *head) + table + bytes(descriptor) + keys + body
+
+
+def dds(data: bytes, rng: random.Random) -> bytes:
+    """Another header before the same texels, with or without the DX10 part."""
+    head = list(struct.unpack_from("<31I", data, 4))
+    newer = list(struct.unpack_from("<5I", data, 128))
+    old = rng.random() < 0.4
+    if old:
+        head[19:26] = rng.choice(
+            (
+                [4, rng.choice((36, 111, 112, 113, 114, 115, 116, 0x31545844, _number(rng))), 0, 0, 0, 0, 0],
+                [0x41, 0, 32, 0xFF0000, 0xFF00, 0xFF, 0xFF000000],
+                [0x40, 0, 24, 0xFF, 0xFF00, 0xFF0000, 0],
+                [rng.choice((2, 0x20, 0x20000, 0x40)), 0, 8, _number(rng), 0, 0, 0],
+            )
+        )
+        head[27] = rng.choice((0, 0xFE00, 0x600, 0x200000, head[27]))
+    for _ in range(rng.choice((0, 1, 1, 2))):
+        if not old and rng.random() < 0.6:
+            newer[rng.randrange(5)] = rng.choice((0, 1, 2, 3, 4, 6, 10, 28, 29, 67, 87, 95, 98, _number(rng)))
+        else:
+            head[rng.randrange(31)] = rng.choice((0, 1, 2, 4, 32, 124, 65536, _number(rng)))
+    return data[:4] + _words(*head) + (b"" if old else _words(*newer)) + data[148:]
+
+
+def npy(data: bytes, rng: random.Random) -> bytes:
+    """Another header before the same numbers, with a length that is right."""
+    (length,) = struct.unpack_from("<H", data, 8)
+    shape = rng.choice(("(6, 2, 2, 3)", "(72,)", "()", "(2**62, 4)", "(-1, 72)", "(6, 12)", "(0,)", "(1,)*40", "[72]"))
+    kind = rng.choice(("<f4", "<f8", ">f4", "|u1", "|O", "<c8", "|S4", "<f2", "|b1", "<U9", "x", "<i4"))
+    text = f"{{'descr': {kind!r}, 'fortran_order': {rng.choice(('True', 'False', '3'))}, 'shape': {shape}, }}"
+    text = rng.choice((text, text, text, text[:-3], "{}", "(" * 200, "\0", text + "#"))
+    version = rng.choice((b"\1\0", b"\1\0", b"\1\0", b"\2\0", b"\3\0"))
+    size = struct.pack("<H" if version[0] == 1 else "<I", len(text) if rng.random() < 0.95 else _number(rng) & 0xFFFF)
+    return data[:6] + version + size + text.encode() + data[10 + length :]
+
+
+def npz(data: bytes, rng: random.Random) -> bytes:
+    """The members of an archive with other headers, names and packing; sizes and checksums are right."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(data)) as archive, zipfile.ZipFile(out, "w") as made, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a name that is there twice
+        for name in archive.namelist():
+            body = archive.read(name)
+            body = npy(body, rng) if rng.random() < 0.5 else body if rng.random() < 0.8 else body[: rng.randrange(200)]
+            name = rng.choice(
+                (name, name, name, "specular_0.npy", "specular_1.npy", "roughness.npy", "error.npy", "../x")
+            )
+            made.writestr(name, body, rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+    found = bytearray(out.getvalue())
+    if rng.random() < 0.2 and (at := found.find(b"PK\1\2")) > 0:  # the directory states another size or method
+        struct.pack_into("<I", found, at + rng.choice((20, 24, 42)), _number(rng))
+    return bytes(found)
+
+
 STRUCTURED = {
+    ".ktx": ktx1,
+    ".ktx2": ktx2,
+    ".dds": dds,
+    ".npy": npy,
+    ".npz": npz,
     ".png": png,
     ".hdr": hdr,
     ".tif": tif,

@@ -7,6 +7,7 @@ import base64
 import contextlib
 import json
 import math
+import os
 import random
 import struct
 import sys
@@ -37,8 +38,9 @@ from whitefurnace.files import (
     write_texture,
 )
 from whitefurnace.files.codec import encode
-from whitefurnace.files.env import EnvMap, write_env
+from whitefurnace.files.env import LEAST_SCALE, MOST_SCALE, EnvMap, write_env
 from whitefurnace.files.gltf_lights import GltfLight, write_gltf_lights
+from whitefurnace.files.memory import VARIABLE
 from whitefurnace.files.packing import step
 from whitefurnace.files.png import encode_png
 from whitefurnace.files.texture import text_value
@@ -423,8 +425,22 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
     return bytes(out)
 
 
+@pytest.fixture
+def bounded(monkeypatch):
+    """Readers may take 64 MB; the process may not grow by much more, whatever a file says."""
+    monkeypatch.setenv(VARIABLE, "64MB")
+    resource = pytest.importorskip("resource") if sys.platform == "linux" else None
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss if resource else 0
+    yield
+    if resource:
+        grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        # Libraries that are loaded during the test take 60 MB, copies and bands of values as much again.
+        assert grown < 250_000, f"the process grew by {grown / 1e3:.0f} MB"
+
+
 def fuzzed(folder: Path, count: int, seed: int) -> int:
     """How many of `count` mutated files held something; any error but ours passes through."""
+    print(f"seed {seed}, {count} files")  # shown where the test fails
     rng = random.Random(seed)
     files = [(path.name, path.read_bytes()) for path in seeds(folder)]
     where = folder / "fuzz"
@@ -433,7 +449,7 @@ def fuzzed(folder: Path, count: int, seed: int) -> int:
     for number in range(count):
         name, data = files[number % len(files)]
         path = where / name
-        # Half of the images are changed in what they state, with checksums and offsets that are right.
+        # Half of them are changed in what they state, with checksums and offsets that are right.
         structured = STRUCTURED.get(path.suffix)
         path.write_bytes(structured(data, rng) if structured and rng.random() < 0.5 else mutated(data, rng))
         try:
@@ -449,15 +465,40 @@ def fuzzed(folder: Path, count: int, seed: int) -> int:
 
 
 @pytest.mark.filterwarnings("error")
-def test_thousands_of_broken_files_are_one_sentence_each(tmp_path, capfd):
+def test_thousands_of_broken_files_are_one_sentence_each(tmp_path, capfd, bounded):
     taken = fuzzed(tmp_path, 2500, 11)
+    assert "seed 11" in capfd.readouterr().out
     assert 100 < taken < 2400  # both ends are seen
     assert capfd.readouterr() == ("", "")  # libraries of C print nothing either
 
 
 @pytest.mark.long
-def test_a_hundred_thousand_broken_files(tmp_path):
-    assert 1000 < fuzzed(tmp_path, 100_000, 12) < 99_000
+def test_a_hundred_thousand_broken_files(tmp_path, bounded):
+    """WHITEFURNACE_FUZZ is another number of files, such as 1000000."""
+    count = int(os.environ.get("WHITEFURNACE_FUZZ", 100_000))
+    assert count / 100 < fuzzed(tmp_path, count, 12) < 0.99 * count
+
+
+@pytest.mark.parametrize(
+    "scale", [1e-9, -0.8, 1e-300, 1e300, 0.04, 21, "0.8", [0.8], True, 10**400, math.nan, math.inf]
+)
+def test_an_absurd_scale_of_lod_is_one_sentence(tmp_path, shell, scale):
+    """A scale of 1e-9 overflowed where the roughness of each level follows from it."""
+    path = written(tmp_path, ".env", "rgbd")
+    data = path.read_bytes()
+    end = data.index(b"\0", 8)
+    manifest = json.loads(data[8:end])
+    manifest["specular"]["lodGenerationScale"] = scale
+    path.write_bytes(data[:8] + json.dumps(manifest).encode() + data[end:])
+    for argv in (("inspect", path), ("bake", path, "-o", tmp_path / "out", "--dry-run")):
+        assert shell(*argv) == 3 and "lodGenerationScale is" in shell.sentence()
+
+
+def test_every_scale_of_lod_that_is_read_gives_a_finite_roughness(tmp_path):
+    chain = [np.ones((6, n, n, 3), np.float32) for n in (64, 32, 16, 8, 4, 2, 1)]
+    for scale in (LEAST_SCALE, 0.8, MOST_SCALE):
+        write_env(tmp_path / "a.env", EnvMap(tuple(chain), np.zeros((9, 3)), lod_scale=scale))
+        assert all(math.isfinite(level.roughness) for level in contents(tmp_path / "a.env").levels)
 
 
 def test_every_file_cut_short_is_exit_3(tmp_path, capsys):

@@ -25,9 +25,6 @@ from whitefurnace.files.jsontext import Reader
 from whitefurnace.files.png import _scratch_file
 from whitefurnace.text import printable
 
-MAX_VALUES = 4_000_000
-"""Largest number of values in a file's JSON, counted by commas and brackets: a few hundred megabytes in Python."""
-
 MAX_ELEMENTS = 1 << 26
 """Largest number of elements in an accessor: as pairs of float64 they take a gigabyte."""
 
