@@ -4,6 +4,8 @@ alpha. And the KTX 1 files of Filament's cmgen, made by the tool itself where it
 from __future__ import annotations
 
 import itertools
+import json
+import re
 import shutil
 import struct
 import subprocess
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from reference import cube_directions
 from whitefurnace import environment
@@ -18,12 +21,14 @@ from whitefurnace.errors import InputError
 from whitefurnace.files import read_light, write_exr, write_texture
 from whitefurnace.files.codec import encode
 from whitefurnace.files.dds import dds_bytes
+from whitefurnace.files.gltf_lights import GltfLight, write_gltf_lights
 from whitefurnace.files.ktx1 import IDENTIFIER as KTX1
 from whitefurnace.files.ktx1 import ktx1_bytes
 from whitefurnace.files.ktx2 import ktx2_bytes
 from whitefurnace.files.texture import Texture, text_value
 from whitefurnace.inspection.comparison import compare
 from whitefurnace.inspection.contents import contents, described
+from whitefurnace.sphere.grids import radiance_at
 
 
 def words(*values: int) -> bytes:
@@ -275,3 +280,49 @@ def test_cmgen_s_own_files_are_read(tmp_path, shell, options, axes):
     found = compare(contents(skybox), contents(ours), axes_a=axes)
     assert found.rows[0].rmse is not None and found.rows[0].rmse < 0.04
     assert shell("bake", skybox, "-o", tmp_path / "out", "--dry-run") == 0
+
+
+# --- lights of glTF ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("degrees", [90.0, -37.0, 180.0])
+def test_the_intensity_and_rotation_of_a_light_are_applied(tmp_path, degrees):
+    """L'(d) = intensity · L(q⁻¹ d), with the rotation of scipy."""
+    half = np.radians(degrees) / 2
+    rotation = (0.0, float(np.sin(half)), 0.0, float(np.cos(half)))
+    level = pattern(cube_directions(32)).astype(np.float32)
+    write_gltf_lights(tmp_path / "a.gltf", GltfLight((level,), np.zeros((9, 3)), rotation, 2.5))
+    env = environment(tmp_path / "a.gltf", rotate=10.0)
+    d = np.random.default_rng(8).normal(size=(3, 200))
+    d /= np.linalg.norm(d, axis=0)
+    turned = Rotation.from_quat(rotation)
+    # `rotate` turns from +X towards +Z, which is a rotation by -10° about +Y.
+    before = (turned.inv() * Rotation.from_euler("y", 10, degrees=True)).apply(d.T)
+    # half the diagonal of a texel, 2.5°, times .8 and 2.5; and the steps of RGBD up to 2.2/255 of 4.5
+    np.testing.assert_allclose(radiance_at(env, d), 2.5 * pattern(before), atol=0.13)
+    said = " ".join(env.notices)
+    assert "an intensity of 2.5" in said and "a rotation about +Y" in said
+
+
+def test_a_light_that_is_tilted_or_one_of_several_is_named(tmp_path, shell):
+    level = np.ones((6, 4, 4, 3), np.float32)
+    light = GltfLight((level,), np.zeros((9, 3)), (0.6, 0.0, 0.0, 0.8))
+    write_gltf_lights(tmp_path / "a.gltf", light)
+    assert shell("bake", tmp_path / "a.gltf", "-o", tmp_path / "out", "--dry-run") == 5
+    assert "rotated about another axis than +Y" in shell.sentence()
+    assert shell("inspect", tmp_path / "a.gltf") == 0 and "rotation 0.6 0 0 0.8" in shell.out
+    write_gltf_lights(tmp_path / "b.gltf", [GltfLight((level,), np.zeros((9, 3))), light])
+    assert "the first of its 2 lights was read" in " ".join(environment(tmp_path / "b.gltf").notices)
+    text = (tmp_path / "a.gltf").read_text()
+    for key, value, says in (
+        ("rotation", [0.0, 0.0, 0.0, 2.0], "rotation of light 0 has the length 2"),
+        ("rotation", [0.0, 0.0, 0.0, 0.0], "has the length 0"),
+        ("intensity", -1.0, "intensity of light 0 is -1"),
+        ("intensity", 1e200, "intensity of light 0 is 1e+200"),
+        ("intensity", 10**400, "intensity of light 0 is"),
+    ):
+        document = json.loads(text)
+        document["extensions"]["EXT_lights_image_based"]["lights"][0][key] = value
+        (tmp_path / "c.gltf").write_text(json.dumps(document))
+        with pytest.raises(InputError, match=re.escape(says)):
+            environment(tmp_path / "c.gltf")

@@ -12,6 +12,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +36,9 @@ NAME = "EXT_lights_image_based"
 GLB_MAGIC = b"glTF"
 _JSON, _BIN = 0x4E4F534A, 0x004E4942  # kinds of GLB chunks [glTF 2.0, 4.4.3]
 MAX_LIGHTS = 16
+MOST_INTENSITY = 1e12
+"""Largest factor of a light's radiance that is read; RGBD holds values up to 255, and the product must be finite."""
+
 MAX_IMAGES = 1 << 16
 _MAX_JSON = 1 << 30
 _DATA = "data:"
@@ -150,7 +154,11 @@ def parse_gltf_lights(source: Source, folder: Path | None = None) -> tuple[GltfL
             take.number(value, f"a number of rotation of {what}")
             for value in take.array(light.get("rotation", [0, 0, 0, 1]), f"rotation of {what}", 4, 4)
         ]
+        if not abs(math.hypot(x, y, z, w) - 1) <= 1e-3:  # the rounding of a quaternion's digits
+            raise source.wrong(f"rotation of {what} has the length {math.hypot(x, y, z, w):g}, a quaternion has 1")
         intensity = take.number(light.get("intensity", 1), f"intensity of {what}")
+        if not 0 <= intensity <= MOST_INTENSITY:
+            raise source.wrong(f"intensity of {what} is {intensity:g}, 0 to {MOST_INTENSITY:g} is read")
         name = take.text(light.get("name", ""), f"name of {what}")
         levels = [
             np.stack([images.face(index, size >> mip, _face(face, mip, what)) for face, index in enumerate(six)])

@@ -13,6 +13,7 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -58,6 +59,8 @@ class Light:
     roughness      perceptual roughness of each level, where the container fixes it
     notices        sentences about what the file states and what was applied
     said           sentences about values that a conversion changed, of the levels that have been decoded
+    intensity      factor of the radiance, not yet applied to the levels
+    turn           radians that are to be added to the azimuth atan2(z, x) of everything; None for another rotation
     polynomials, irradiance, irradiance_sh   Babylon's (9, 3) and (6, n, n, 3), and glTF's (9, 3) without a scale
     """
 
@@ -77,6 +80,8 @@ class Light:
     irradiance_sh: npt.NDArray[np.float64] | None = None
     notices: tuple[str, ...] = ()
     said: list[str] = field(default_factory=list)
+    intensity: float = 1.0
+    turn: float | None = 0.0
 
 
 def is_light(path: str | os.PathLike[str]) -> bool:
@@ -173,13 +178,28 @@ def _deferred(texture: Texture, k: int, name: str, said: list[str]) -> Deferred:
     return Deferred((*shape, texture.meaning.channels(FORMATS[texture.format].channels)), decoded)
 
 
-def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool, tuple[str, ...], float]:
-    """Read level 0 as radiance: (6, n, n, 1 | 3 | 4) and True for a cube, (h, w, 1 | 3 | 4) and False for an image.
+class Radiance(NamedTuple):
+    """Level 0 of a light as radiance.
 
-    The third value holds sentences about what the file states and what was applied, the fourth is the largest finite
-    value that the format holds in each of R, G and B. Raises the errors of `read_light`,
-    `InputError` for arrays and for textures of two channels, and `UnsupportedError` where the package that decodes the
-    format is not installed.
+    texels   float32 (6, n, n, 1 | 3 | 4) of a cube, or (h, w, 1 | 3 | 4) of an image
+    notices  sentences about what the file states and what was applied
+    largest  the largest finite value that the format holds in each of R, G and B
+    turn     radians that are to be added to the azimuth atan2(z, x) of everything
+    """
+
+    texels: Texels
+    cube: bool
+    notices: tuple[str, ...]
+    largest: float
+    turn: float = 0.0
+
+
+def read_radiance(path: str | os.PathLike[str]) -> Radiance:
+    """Read level 0 of the light in a file as radiance. The intensity of a light of glTF is applied.
+
+    Raises the errors of `read_light`, `InputError` for arrays and for textures of two channels, and `UnsupportedError`
+    where the package that decodes the format is not installed, and for a light that is turned about another axis than
+    +Y.
     """
     light = read_light(path)
     if light.layers:
@@ -190,8 +210,14 @@ def read_radiance(path: str | os.PathLike[str]) -> tuple[Texels, bool, tuple[str
     first = light.levels[0]
     if first.shape[-1] not in (1, 3, 4):
         raise InputError(f"{path} has {first.shape[-1]} channels ({light.format}), 1, 3 or 4 were expected")
-    texels = first.decode() if isinstance(first, Deferred) else first
-    return np.ascontiguousarray(texels), light.cube, (*light.notices, *light.said), min(light.largest[:3])
+    if light.turn is None:
+        raise UnsupportedError(f"{path}: its light is rotated about another axis than +Y; give it without a rotation")
+    texels = np.ascontiguousarray(first.decode() if isinstance(first, Deferred) else first)
+    if light.intensity != 1:
+        with np.errstate(over="ignore"):  # what becomes infinite is found as such
+            texels = texels * np.float32(light.intensity)
+    largest = min(light.largest[:3]) * light.intensity
+    return Radiance(texels, light.cube, (*light.notices, *light.said), largest, light.turn)
 
 
 def _env(source: Source) -> Light:
@@ -239,6 +265,14 @@ def _gltf(path: Path) -> Light:
     if found.rotation != (0.0, 0.0, 0.0, 1.0):
         facts["rotation"] = " ".join(f"{x:g}" for x in found.rotation)
     roughness = tuple(k / (count - 1) for k in range(count)) if count > 1 else None
+    turn = _azimuth(found.rotation)
+    notices = []
+    if len(lights) > 1:
+        notices.append(f"{path}: the first of its {len(lights)} lights was read")
+    if found.intensity != 1:
+        notices.append(f"{path}: states an intensity of {found.intensity:g}, which multiplies the radiance")
+    if turn:
+        notices.append(f"{path}: states a rotation about +Y, which turns the light by {math.degrees(turn):g}°")
     return Light(
         "glTF",
         f"rgbd ({FORMATS['rgbd'].title}), EXT_lights_image_based",
@@ -250,7 +284,22 @@ def _gltf(path: Path) -> Light:
         facts,
         roughness=roughness,
         irradiance_sh=found.coefficients,
+        notices=tuple(notices),
+        intensity=found.intensity,
+        turn=turn,
     )
+
+
+def _azimuth(rotation: tuple[float, float, float, float]) -> float | None:
+    """Return what a rotation x y z w adds to the azimuth atan2(z, x), in radians; None for one not about +Y.
+
+    A right-handed rotation by θ about +Y takes +X towards -Z, which lowers the azimuth by θ.
+    """
+    x, y, z, w = rotation
+    # 1e-6: the rounding of float32, in which programs keep quaternions
+    if max(abs(x), abs(z)) > 1e-6:
+        return None
+    return math.remainder(-2 * math.atan2(y, w), 2 * math.pi)
 
 
 def light_files(path: str | os.PathLike[str]) -> dict[str, Path]:

@@ -213,7 +213,7 @@ def read_environment(
         files = _six(path, reading.layout)
         found = _from_image(path, reading) if files is None else _from_six(path, *files, reading)
         _check_unchanged(path, reading.layout, before, found.digest)
-        found = replace(found, rotation=turn)
+        found = replace(found, rotation=math.remainder(found.rotation + turn, 2 * math.pi))
     elif isinstance(source, np.ndarray):
         found = replace(_from_array(source, reading), rotation=turn)
     else:
@@ -367,15 +367,18 @@ def _from_container(path: Path, reading: Reading) -> Environment:
     """Level 0 of a cube, or a 2-D texture in one of the layouts."""
     if reading.layer is not None:
         raise UsageError(f"{path} is not OpenEXR and has no layer {reading.layer!r}")
-    pixels, cube, said, largest = read_radiance(path)
-    notices = list(said)
+    found = read_radiance(path)
+    pixels, cube, largest, notices = found.texels, found.cube, found.largest, list(found.notices)
     if cube and reading.layout is not None:
         raise InputError(f"{path} is a cube, --layout {reading.layout} is of an image")
     layout = None if cube else layout_of(pixels.shape, str(path), notices, asked=reading.layout)
     clean(pixels if cube else pixels[None], layout, str(path), reading.bad_pixels, notices, largest=largest)
+    digest = light_digest(path)
     if layout is None:
-        return _cube(pixels, path.stem, "cube", light_digest(path), notices)
-    return _placed(pixels, layout, path.stem, light_digest(path), notices)
+        made = _cube(pixels, path.stem, "cube", digest, notices)
+    else:
+        made = _placed(pixels, layout, path.stem, digest, notices)
+    return replace(made, rotation=found.turn)
 
 
 def _from_array(array: npt.NDArray[Any], reading: Reading) -> Environment:
