@@ -13,7 +13,11 @@ import warnings
 import zipfile
 import zlib
 
+import numpy as np
+
 from changed_values import changed_env, changed_json
+from exr_writer import Part
+from exr_writer import exr as write_exr
 from whitefurnace.files.zstd import compress
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -291,6 +295,102 @@ def webp(data: bytes, rng: random.Random) -> bytes:
     return b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body
 
 
+# --- OpenEXR ---------------------------------------------------------------------------------------------
+
+_LAYERS = ("", "", "", "left", "right", "beauty", "ViewLayer.Combined", "normal", "crypto00", "a\nb", "x" * 60)
+_CHANNELS = (
+    ("R", "G", "B"),
+    ("R", "G", "B", "A"),
+    ("Y",),
+    ("Z",),
+    ("X", "Y", "Z"),
+    ("Y", "RY", "BY"),
+    ("r", "g", "b"),
+    ("R", "G"),
+    ("A",),
+    ("U", "V"),
+)
+_EXR_KINDS = (
+    "float",
+    "int",
+    "string",
+    "box2i",
+    "v2f",
+    "m44f",
+    "chromaticities",
+    "envmap",
+    "stringvector",
+    "chlist",
+    "x",
+)
+
+
+def _exr_attribute(rng: random.Random) -> tuple[str, tuple[str, bytes]]:
+    """An attribute that readers look at; in one of five, its value or its type is not what it should be."""
+    known = {
+        "envmap": ("envmap", bytes([rng.choice((0, 0, 1, 1, 2, 255))])),
+        "chromaticities": (
+            "chromaticities",
+            struct.pack("<8f", *(rng.choice((0, 0.3, 0.64, 1, -1)) for _ in range(8))),
+        ),
+        "pixelAspectRatio": ("float", struct.pack("<f", rng.choice((1, 1, 2, 0, -1, float("nan"), float("inf"))))),
+        "whiteLuminance": ("float", struct.pack("<f", rng.choice((100, 0, float("nan"))))),
+        "adoptedNeutral": ("v2f", struct.pack("<2f", rng.random(), rng.random())),
+        "worldToCamera": ("m44f", struct.pack("<16f", *(rng.uniform(-1, 1) for _ in range(16)))),
+        "colorInteropID": ("string", rng.choice((b"lin_ap1_scene", b"srgb_rec709_scene", b"data", b"\xff", b"a\nb"))),
+        "oiio:ColorSpace": ("string", rng.choice((b"lin_rec709", b"sRGB", b"Filmic", b""))),
+        "acesImageContainerFlag": ("int", struct.pack("<i", rng.choice((0, 1, 2)))),
+        "wrapmodes": ("string", rng.choice((b"clamp", b"a\nb", b"x" * 300))),
+        "multiView": (
+            "stringvector",
+            struct.pack("<i", 4) + b"left" + struct.pack("<i", rng.choice((5, 5, 99))) + b"right",
+        ),
+        "view": ("string", rng.choice((b"left", b"right", b""))),
+        "compression": ("compression", bytes([rng.choice((0, 0, 1, 3, 9, 12, 255))])),
+        "lineOrder": ("lineOrder", bytes([rng.choice((0, 1, 2, 9))])),
+        "type": ("string", rng.choice((b"scanlineimage", b"tiledimage", b"deepscanline", b"deeptile", b"?"))),
+        "tiles": ("tiledesc", struct.pack("<IIB", rng.choice((0, 1, 64, 1 << 31)), 8, rng.choice((0, 1, 2, 17, 255)))),
+        "whitefurnace:sh": ("m44f", bytes(64)),
+        "whitefurnace:key": ("string", b"k"),
+        "Orientation": ("int", struct.pack("<i", rng.choice((1, 6, 9, -1)))),
+    }
+    name = rng.choice(tuple(known))
+    kind, value = known[name]
+    if rng.random() < 0.05:
+        kind = rng.choice(_EXR_KINDS)
+    if rng.random() < 0.05:
+        value = rng.choice((b"", value[:-1], value + b"\0", rng.randbytes(rng.randrange(40))))
+    return name, (kind, value)
+
+
+def exr(data: bytes, rng: random.Random) -> bytes:
+    """One to three parts with any layers, windows and attributes; `data` is not used."""
+    parts = []
+    for number in range(rng.choice((1, 1, 2, 3))):
+        height, width = rng.choice((*((4, 8),) * 9, (12, 2), (12, 2), (1, 1), (3, 4), (5, 7)))
+        found: dict[str, np.ndarray] = {}
+        for _ in range(rng.choice((1, 1, 1, 2, 3))):
+            layer, names = rng.choice(_LAYERS), rng.choice((*_CHANNELS[:2] * 5, *_CHANNELS))
+            kind = rng.choice((*(np.float16,) * 6, *(np.float32,) * 6, np.uint32))
+            for name in names:
+                value = rng.choice((*(1,) * 20, 0, -1e-6, float("inf"), float("nan"))) if kind is not np.uint32 else 1
+                found[f"{layer}.{name}" if layer else name] = np.full((height, width), value, kind)
+        left, top = rng.choice((*((0, 0),) * 12, (-1, 2), (1 << 30, 0)))
+        display = rng.choice((*(None,) * 12, (0, 0, 7, 3), (0, 0, 8, 3), (0, 0, -5, 2), (0, 0, 1 << 30, 1 << 30)))
+        attributes = dict(_exr_attribute(rng) for _ in range(rng.choice((0, 0, 1, 1, 2, 4))))
+        if rng.random() < 0.05:
+            edge = rng.choice((0, 9, 1000, 1 << 20, (1 << 31) - 1))
+            attributes["dataWindow"] = "box2i", struct.pack("<4i", 0, 0, edge, rng.choice((edge, 1, 3)))
+        name = rng.choice((f"part{number}", f"part{number}", "beauty", "depth", "")) if rng.random() < 0.95 else "a\nb"
+        parts.append(Part(found, name, attributes, (left, top), display))
+    out = bytearray(write_exr(*parts))
+    if rng.random() < 0.05:
+        out = out[: rng.randrange(1, len(out))]
+    if rng.random() < 0.1:
+        out[rng.randrange(len(out))] = rng.randrange(256)
+    return bytes(out)
+
+
 # --- textures and arrays ---------------------------------------------------------------------------------
 
 
@@ -441,6 +541,7 @@ STRUCTURED = {
     ".tif": tif,
     ".jpg": jpg,
     ".webp": webp,
+    ".exr": exr,
     ".gltf": changed_json,
     ".json": changed_json,
     ".env": changed_env,

@@ -22,15 +22,16 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from exr_writer import Part, exr, planes
 from reference import cube_directions
 from shell import command, mounted, tree
 from whitefurnace import bake, dfg, prefilter
 from whitefurnace.baking.request import BakeRequest
 from whitefurnace.errors import UsageError
-from whitefurnace.files import Transaction, write_exr
+from whitefurnace.files import Transaction, read_image, write_exr
 from whitefurnace.opencl import source as kernels
 from whitefurnace.opencl.device import Device
-from whitefurnace.sphere.environments import cube_solid_angles
+from whitefurnace.sphere.environments import cube_solid_angles, latlong_solid_angles
 
 SMALL = ("--size", "32", "--min-size", "8")
 SIZES = dict(size=32, min_size=8)
@@ -981,3 +982,85 @@ def test_bake_and_its_request_have_the_same_options():
 def test_an_unknown_option_is_refused_by_python(tmp_path):
     with pytest.raises(TypeError, match="sizes"):
         bake(noise(), tmp_path, sizes=32)
+
+
+# --- images in their own size, and how sources are read --------------------------------------------------
+
+
+def test_engines_that_filter_an_image_get_it_in_its_own_size(tmp_path, shell):
+    pixels = noise(4, 75)
+    source = image(tmp_path / "a.exr", pixels)
+    out = tmp_path / "out"
+    assert shell("bake", source, "-o", out, "--for", "godot,unity,exr", "--min-size", "128") == 0
+    found, _ = read_exr(out / "unity" / "a.exr")
+    np.testing.assert_array_equal(found, pixels)
+    assert read_image(out / "godot" / "a.hdr").pixels.shape == (75, 150, 3)
+    # Levels of the chain keep the chain's size.
+    assert read_exr(out / "exr" / "a_specular_0_latlong.exr")[0].shape == (512, 1024, 3)
+    assert shell("bake", source, "-o", out, "--for", "godot,unity,exr", *SMALL) == 0
+    assert read_exr(out / "unity" / "a.exr")[0].shape == (64, 128, 3)
+    assert "godot: its image has 128 x 64 texels, and the source has 75 rows" in shell.err
+
+
+def test_a_cube_becomes_an_image_of_two_faces_height(tmp_path):
+    cube = np.random.default_rng(5).random((6, 20, 20, 3)).astype(np.float32)
+    source = np.concatenate(cube)  # a vertical strip
+    (baked,) = bake(source, tmp_path, for_="unreal")
+    found = read_image(tmp_path / "unreal" / "array.hdr").pixels
+    assert found.shape == (40, 80, 3)
+    assert found.mean() == pytest.approx(0.5, abs=0.05)
+    assert not any("its image has" in notice for notice in baked.notices)
+
+
+def half_sun(path):
+    """A lat-long of half floats whose 2 x 2 sun overflowed."""
+    pixels = np.full((64, 128, 3), 0.25, np.float16)
+    pixels[20:22, 40:42] = np.inf
+    path.write_bytes(exr(Part(planes(pixels))))
+    return path
+
+
+def test_an_overflowed_sun_becomes_the_largest_half(tmp_path, shell):
+    source = half_sun(tmp_path / "a.exr")
+    out = tmp_path / "out"
+    assert shell("bake", source, "-o", out, *SMALL) == 3
+    assert "--bad-pixels clamp" in shell.err and "65504" in shell.err
+    assert shell("bake", source, "-o", out, *SMALL, "--bad-pixels", "clamp") == 0
+    assert "12 +inf values were set to 65504" in shell.err
+    manifest = verified(out)
+    assert manifest["recipe"]["bad_pixels"] == "clamp"
+    assert any("+inf" in notice for notice in manifest["source"]["notices"])
+    # E/π at the centres of the cube's texels is Σ L cosθ ω/π over the texels of the image.
+    directions = latlong_directions(64, 128).reshape(-1, 3)
+    angles = np.repeat(latlong_solid_angles(64, 128), 128)
+    radiance = np.full((64, 128), 0.25)
+    radiance[20:22, 40:42] = 65504
+    normals = cube_directions(32).reshape(-1, 3)
+    want = (np.maximum(normals @ directions.T, 0) * (radiance.ravel() * angles)).sum(1).max() / np.pi
+    got = load(out)["irradiance"].max()
+    assert got == pytest.approx(want, rel=1e-3)  # a texel of 2.8° taken as its centre: 1 - cos of a third of it
+
+
+@pytest.mark.parametrize(
+    "option, value",
+    [("--bad-pixels", "clamp"), ("--layout", "latlong"), ("--layer", "beauty"), ("--fill", "black")],
+)
+def test_options_of_reading_are_part_of_the_key(tmp_path, shell, option, value):
+    part = Part(planes(noise(1, 4)), "beauty")
+    source = tmp_path / "a.exr"
+    source.write_bytes(exr(part, Part(planes(noise(2, 4)), "other")))
+    assert shell("bake", source, "-o", tmp_path / "out", *SMALL) == 0
+    before = verified(tmp_path / "out")["key"]
+    assert shell("bake", source, "-o", tmp_path / "out", *SMALL, option, value) == 0
+    after = verified(tmp_path / "out")
+    assert after["key"] != before and value in after["recipe"].values()
+    assert shell("bake", source, "-o", tmp_path / "out", *SMALL, option, value) == 0 and "up to date" in shell.out
+
+
+def test_six_files_of_a_shell_pattern_are_one_environment(tmp_path, shell):
+    names = "px nx py ny pz nz".split()
+    files = [image(tmp_path / f"m0_{name}.exr", np.full((8, 8, 3), k, np.float32)) for k, name in enumerate(names)]
+    assert shell("bake", *files, "-o", tmp_path / "out", *SMALL) == 0
+    assert verified(tmp_path / "out", "m0")["source"]["layout"] == "six faces"
+    assert shell("bake", files[3], "-o", tmp_path / "out", *SMALL) == 0 and "m0: up to date" in shell.out
+    assert shell("bake", tmp_path / "m0_*.exr", "-o", tmp_path / "out", *SMALL) == 0 and "m0: up to date" in shell.out

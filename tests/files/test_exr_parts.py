@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import random
 import struct
 
 import numpy as np
 import pytest
 
+import mutations
 from exr_writer import Part, exr, floats, planes, text
 from reference import cube_directions
 from whitefurnace.errors import InputError, UsageError
@@ -248,7 +250,9 @@ def test_a_latlong_of_openexr_is_a_latlong(tmp_path):
     np.testing.assert_array_equal(env.texels, RGB.astype(np.float32))
 
 
-@pytest.mark.parametrize("kind, shape", [(0, (12, 16)), (0, (6, 1)), (1, (4, 8)), (1, (1, 6)), (0, (9, 17))])
+@pytest.mark.parametrize(
+    "kind, shape", [(0, (12, 16)), (0, (6, 1)), (1, (4, 8)), (1, (1, 6)), (1, (1, 1)), (0, (9, 17))]
+)
 def test_a_size_that_contradicts_the_attribute_is_refused(tmp_path, kind, shape):
     path = saved(
         tmp_path, Part(planes(np.ones((*shape, 3), np.float32)), attributes={"envmap": ("envmap", bytes([kind]))})
@@ -393,3 +397,49 @@ def test_every_byte_of_a_header_that_is_cut_is_one_sentence(tmp_path):
         with pytest.raises(InputError) as error:
             read_parts(path, length)
         one_sentence(error, str(path))
+
+
+# --- anything at all ------------------------------------------------------------------------------------
+
+
+def fuzzed(folder, count, seed):
+    """How many of `count` files with structured headers are environments; any error but ours passes through."""
+    rng = random.Random(seed)
+    print(f"seed {seed}")
+    taken = 0
+    path = folder / "a.exr"
+    for _ in range(count):
+        path.write_bytes(mutations.exr(b"", rng))
+        layer = rng.choice((None, None, None, "beauty", "left", "Combined", "normal"))
+        options = {
+            "layer": layer,
+            "fill": rng.choice((None, None, "black")),
+            "layout": rng.choice((None, None, None, "latlong", "cross", "column", "openexr-cube")),
+            "bad_pixels": rng.choice(("refuse", "zero", "clamp")),
+        }
+        shape = None
+        try:
+            shape = extent(path, Reading(**options))
+        except (InputError, UsageError) as error:
+            said = str(error)
+        try:
+            env = environment(path, **options)
+        except (InputError, UsageError) as error:
+            said = str(error)
+            assert str(path) in said and "\n" not in said and len(said) < 700, said
+        else:
+            taken += 1
+            assert shape == (env.kind, *env.texels.shape[-3:-1]), (shape, env.texels.shape)
+            assert np.isfinite(env.texels).all() and env.texels.min() >= 0
+            assert not any("\n" in notice for notice in env.notices), env.notices
+    return taken
+
+
+@pytest.mark.filterwarnings("error")
+def test_hundreds_of_structured_headers_are_environments_or_one_sentence(tmp_path):
+    assert 20 < fuzzed(tmp_path, 600, 21) < 500  # both ends are seen
+
+
+@pytest.mark.long
+def test_twenty_thousand_structured_headers(tmp_path):
+    assert 1000 < fuzzed(tmp_path, 20_000, 22) < 19_000

@@ -22,7 +22,7 @@ from whitefurnace import dfg, integrate, lut
 from whitefurnace.catalogue import INTEGRALS
 from whitefurnace.catalogue.roughness import alpha_of_roughness
 from whitefurnace.errors import FileError, UsageError
-from whitefurnace.files import scratch, write_npy
+from whitefurnace.files import scratch, write_exr, write_npy
 from whitefurnace.tables.axes import Axis, axis
 
 
@@ -464,3 +464,25 @@ def test_scratch_has_no_name(tmp_path):
         assert array.shape == (8, 8) and (array == 5).all() and tree(tmp_path) == {}
     with pytest.raises(FileError), scratch(tmp_path / "none" / "t", (8,), np.float32, lambda out: None):
         pass
+
+
+def test_an_environment_of_a_table_is_read_as_bakes_read_it(tmp_path, shell, monkeypatch):
+    """The word demo, options of reading and notices, in a command and in a job."""
+    monkeypatch.chdir(tmp_path)
+    write_exr(tmp_path / "a.exr", np.where(np.arange(96).reshape(4, 8, 3) == 7, np.inf, 1).astype(np.float32))
+    table = ("--diffuse", "lambert:albedo=.5", "--size", "2", "--tolerance", ".01")
+    assert shell("lut", "radiance", "-o", "r.npy", "--environment", "demo", *table) == 0
+    assert (
+        shell("lut", "radiance", "-o", "s.npy", "--environment", "a.exr", *table) == 3 and "--bad-pixels" in shell.err
+    )
+    assert shell("lut", "radiance", "-o", "s.npy", "--environment", "a.exr", *table, "--bad-pixels", "zero") == 0
+    assert "1 not finite value was set to 0" in shell.err
+    manifest = json.loads((tmp_path / "s.npy.json").read_text())
+    assert manifest["environment"]["bad_pixels"] == "zero" and "not finite" in manifest["notices"][0]
+    job = '[[lut]]\nkind = "radiance"\noutput = "{}"\nenvironment = "{}"\n'
+    job += 'diffuse = "lambert:albedo=.5"\nsize = 2\ntolerance = 0.01\n{}\n'
+    text = job.format("j.npy", "demo", "") + job.format("k.npy", "a.exr", 'bad-pixels = "zero"')
+    (tmp_path / "j.toml").write_text(text)
+    assert shell("batch", "j.toml") == 0
+    for one, other in (("r", "j"), ("s", "k")):
+        np.testing.assert_array_equal(np.load(f"{one}.npy"), np.load(f"{other}.npy"))

@@ -103,6 +103,7 @@ class BakePlan:
     engines  the target engines
     chains   the chain of each engine
     reading  how environments are read
+    image    whether engines that filter an image themselves get it in its own size, not in that of the chain
     The other fields are options of `bake`.
     """
 
@@ -116,6 +117,7 @@ class BakePlan:
     force: bool
     as_read: bool = False
     window: str | float = "auto"
+    image: bool = False
 
     @property
     def recipe(self) -> Chain:
@@ -160,6 +162,7 @@ def plan(request: BakeRequest) -> BakePlan:
         request.force,
         bool(request.as_read) or request.fit is not None,
         window,
+        request.size is None,
     )
 
 
@@ -499,7 +502,7 @@ def _read(
     env, sun = without_sun(env, request.sun)
     recipe = _canonical(request, env.rotation, env.exposure)
     key = _key(env.digest, recipe)
-    written = targets_of(request, name)
+    written = targets_of(request, name, _image_rows(request, env))
     planned = planned_levels(request, math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2))
     files = tuple(t.path for t in written)
     sizes = tuple(t.nbytes for t in written)
@@ -525,7 +528,7 @@ def _read(
             {"key": key, "recipe": recipe},
             planned,
             sizes,
-            (*env.notices, *notices),
+            (*env.notices, *_resized(request, env), *notices),
             as_read=shown,
             programs=_programs(request, env),
         )
@@ -562,7 +565,7 @@ def compute(
     with system_errors(request.output):
         on = loaded.on or (device if isinstance(device, Device) else choose_device(device))
         report = (lambda part, share: progress(name, part, share)) if progress else None
-        wants, of = _wanted(request)
+        wants, of = _wanted(request, loaded.env)
         lit = light(on, loaded.env, wants, seed=loaded.key, progress=report)
         ndf = EntryKey.of(request.recipe.ndf)
         table = _table(on, ndf)
@@ -646,24 +649,47 @@ def _write(made: Computed) -> Baked:
         manifest,
         loaded.planned,
         tuple(t.nbytes for t in written),
-        (*loaded.env.notices, *made.table.notices, *format_notices(manifest)),
+        (*loaded.env.notices, *_resized(request, loaded.env), *made.table.notices, *format_notices(manifest)),
         rows,
         time.perf_counter() - loaded.begin,
         tuple(manifest.get("as_read", ())),
     )
 
 
-def targets_of(request: BakePlan, name: str) -> list[Target]:
-    """Return the planned files of every engine for an environment called `name`."""
+def _image_rows(request: BakePlan, env: Environment) -> int:
+    """Return the rows of the image for engines that filter it themselves; 0 where it has the size of the chain.
+
+    A cube becomes a lat-long of as many rows as two of its faces.
+    """
+    return env.texels.shape[-3] * (1 if env.kind == "latlong" else 2) if request.image else 0
+
+
+def _resized(request: BakePlan, env: Environment) -> list[str]:
+    """Return notices of images that `size` makes smaller or larger than their source."""
+    own = _image_rows(replace(request, image=True), env)
     return [
-        target
+        f"{engine.name}: its image has {4 * recipe.size} x {2 * recipe.size} texels, and the source has {own} rows; "
+        "without --size it has as many as the source"
         for engine, recipe in zip(request.engines, request.chains, strict=True)
-        for target in targets(engine, recipe, request.output, name)
+        if engine.holding("environment") and not request.image and 2 * recipe.size != own
     ]
 
 
-def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
+def targets_of(request: BakePlan, name: str, image: int = 0) -> list[Target]:
+    """Return the planned files of every engine for an environment called `name`.
+
+    image: rows of the image that engines filter themselves; 0 for those of the chain's size.
+    """
+    return [
+        target
+        for engine, recipe in zip(request.engines, request.chains, strict=True)
+        for target in targets(engine, recipe, request.output, name, image)
+    ]
+
+
+def _wanted(request: BakePlan, env: Environment) -> tuple[list[Want], list[tuple[int, int]]]:
     """Return the distinct chains to make, and for each engine the indices of its own chain and of Charlie's."""
+    rows = _image_rows(request, env)
 
     def most(a: int | None, b: int | None) -> int | None:
         return None if a is None or b is None else max(a, b)  # None: all
@@ -675,8 +701,9 @@ def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
         own = Want(
             recipe,
             None if engine.cubes("specular") else 0,
-            None if engine.latlong else min(len(engine.holding("environment")), 1),
+            None if engine.latlong else min(len(engine.holding("environment")), 0 if rows else 1),
             None if engine.octahedral else 0,
+            rows if engine.holding("environment") else 0,
         )
         sheen = Want(
             replace(
@@ -698,6 +725,7 @@ def _wanted(request: BakePlan) -> tuple[list[Want], list[tuple[int, int]]]:
                     most(old.cubes, want.cubes),
                     most(old.latlongs, want.latlongs),
                     most(old.octahedral, want.octahedral),
+                    max(old.image, want.image),
                 )
             places.append(place)
         of.append((places[0], places[1]))
@@ -723,7 +751,8 @@ def _rows_of(
                 continue
             if name in ("latlongs", "latlong_coverage") and not (engine.latlong or engine.holding("environment")):
                 continue
-            levels = getattr(chain_, name)
+            own = engine.holding("environment") and chain_.image
+            levels = getattr(chain_, name.replace("latlongs", "image").replace("latlong", "image") if own else name)
             kept = chain_.energy_kept if name == "levels" else [None] * len(levels)
             for level, k in zip(levels, kept, strict=True):
                 old = found.get(id(level), (level, k, ndf, ()))  # level 0 is of every NDF
@@ -735,10 +764,10 @@ def _rows_of(
 
 def _programs(request: BakePlan, env: Environment) -> tuple[Program, ...]:
     """The kernel programs of a bake."""
-    wants, _ = _wanted(request)
+    wants, _ = _wanted(request, env)
     texel = math.pi / env.texels.shape[-3] / (1 if env.kind == "latlong" else 2)
     # A part that no engine has needs no program.
-    chains = [want.recipe for want in wants if (want.cubes, want.latlongs, want.octahedral) != (0, 0, 0)]
+    chains = [want.recipe for want in wants if (want.cubes, want.latlongs, want.octahedral, want.image) != (0, 0, 0, 0)]
     charlie = [e.dfg.charlie_masking for e in request.engines if e.dfg.charlie and e.holding("dfg")]
     return programs(chains or [wants[0].recipe], env.kind, texel, demo=env.name == DEMO, charlie=charlie)
 
@@ -855,6 +884,7 @@ def _canonical(request: BakePlan, rotation: float, exposure: float) -> dict[str,
         "rotate": round(math.degrees(rotation), 9),
         "exposure": exposure,
         **request.reading.recipe(),
+        **({"image": "own"} if request.image and any(e.holding("environment") for e in request.engines) else {}),
         "sun": request.sun,
         "irradiance": IRRADIANCE_SIZE,
         **({"as_read": True} if request.as_read else {}),

@@ -116,12 +116,21 @@ class Container:
     encode: Callable[[Engine, Chain, Path, str, Made], list[Encoded]]
 
 
-def targets(engine: Engine, chain: Chain, folder: Path, stem: str) -> list[Target]:
-    """Plan the files of an engine under `folder`/ENGINE. Raises UsageError for a file that cannot be made."""
+def targets(engine: Engine, chain: Chain, folder: Path, stem: str, image: int = 0) -> list[Target]:
+    """Plan the files of an engine under `folder`/ENGINE. Raises UsageError for a file that cannot be made.
+
+    image: rows of the image that engines filter themselves; 0 for those of the chain's size.
+    """
     if engine.container != "files":
         return CONTAINERS[engine.container].planned(engine, chain, folder, stem)
     found = [
-        Target(_path(engine, folder, stem, file), engine.name, WRITERS[file.holds].planned_size(engine, chain, file))
+        Target(
+            _path(engine, folder, stem, file),
+            engine.name,
+            _image_bytes(file, image)
+            if image and file.holds == "environment"
+            else WRITERS[file.holds].planned_size(engine, chain, file),
+        )
         for file in engine.file
     ]
     return [*found, *_snippets(engine, chain, folder, stem)]
@@ -448,15 +457,20 @@ def _gltf(engine: Engine, path: Path, levels: Sequence[Level], made: Made) -> En
 
 
 def _environment_size(engine: Engine, chain: Chain, file: File) -> int:
-    return (4 if file.suffix == ".hdr" else 12) * 8 * chain.size**2  # a lat-long of (2s, 4s)
+    return _image_bytes(file, 2 * chain.size)
+
+
+def _image_bytes(file: File, rows: int) -> int:
+    return (4 if file.suffix == ".hdr" else 12) * 2 * rows**2
 
 
 def _environment(engine: Engine, path: Path, file: File, made: Made) -> Encoded:
-    level = made.chain.latlongs[0]
+    level = (made.chain.image or made.chain.latlongs)[0]
     rows, columns = level.texels.shape[:2]
     stated: dict[str, Any] = {"holds": "environment", "format": file.stored}
     if file.suffix == ".exr":
-        alpha = made.chain.latlong_coverage[0].texels[..., :1] if made.chain.latlong_coverage else None
+        covered = made.chain.image_coverage or made.chain.latlong_coverage
+        alpha = covered[0].texels[..., :1] if covered else None
         pixels = level.texels if alpha is None else np.concatenate([level.texels, alpha], -1)
         stated |= {"levels": [{"size": columns, "roughness": 0.0, "error": level.error}]}
         return Encoded(

@@ -136,7 +136,7 @@ def choose(path: Path, size: int, layer: str | None = None) -> Choice:
     part = found.of
     wrong = [c.name for c in part.channels if c.name in found.picks() and c.kind == "uint"]
     if wrong:
-        raise InputError(f"{path} holds 32-bit integers in {', '.join(wrong)}, floats were expected")
+        raise InputError(f"{path} holds 32-bit integers in {_listed(wrong)}, floats were expected")
     if any((c.across, c.down) != (1, 1) for c in part.channels if c.name in found.picks()):
         raise InputError(f"{path} holds channels of different sizes (subsampled), channels of one size were expected")
     envmap = part.attributes.get("envmap")

@@ -20,7 +20,7 @@ from whitefurnace.prefiltering.recipe import CERTIFIED, IRRADIANCE_SIZE, Chain, 
 from whitefurnace.results import Integrated
 from whitefurnace.sphere.bad_pixels import check_bad_pixels
 from whitefurnace.sphere.environments import Environment, Reading, read_environment
-from whitefurnace.sphere.grids import source_solid_angles
+from whitefurnace.sphere.grids import Shape, source_solid_angles
 
 
 @dataclass(frozen=True)
@@ -95,12 +95,14 @@ class Want:
     """A chain that a bake needs.
 
     cubes, latlongs, octahedral  number of its first levels in this form, None for all
+    image                        rows of a lat-long of level 0, whatever the size of the chain; 0 for none
     """
 
     recipe: Chain
     cubes: int | None = None
     latlongs: int | None = 0
     octahedral: int | None = 0
+    image: int = 0
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ class Filtered:
     levels, latlongs, octahedral  levels as cubes, lat-longs and octahedral maps
     energy_kept                   mean radiance of each cube over that of the source, minus 1
     coverage, ...                 the same levels of the source's coverage; empty where it has none
+    image, image_coverage         the lat-long of level 0 that was asked for, and its coverage
     """
 
     levels: tuple[Level, ...]
@@ -119,6 +122,8 @@ class Filtered:
     latlong_coverage: tuple[Level, ...]
     octahedral: tuple[Level, ...] = ()
     octahedral_coverage: tuple[Level, ...] = ()
+    image: tuple[Level, ...] = ()
+    image_coverage: tuple[Level, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -168,8 +173,8 @@ def light(
         jobs, _, tolerances = _distinct(convolver, wants)
         coverage = _run(convolver, jobs, tolerances, recipe.certify)
     chains = []
-    for cubes, wide, square in places:
-        covered = [tuple(coverage[k] for k in some) if coverage else () for some in (cubes, wide, square)]
+    for cubes, wide, square, image in places:
+        covered = [tuple(coverage[k] for k in some) if coverage else () for some in (cubes, wide, square, image)]
         chains.append(
             Filtered(
                 tuple(levels[k] for k in cubes),
@@ -179,6 +184,8 @@ def light(
                 covered[1],
                 tuple(levels[k] for k in square),
                 covered[2],
+                tuple(levels[k] for k in image),
+                covered[3],
             )
         )
     return Lighting(tuple(chains), levels[-1], sh, sh_error, time.perf_counter() - begin)
@@ -198,7 +205,7 @@ def _distinct(
 ) -> tuple[list[Job], list[tuple[list[int], ...]], list[float]]:
     """Return the distinct jobs of all chains, with their tolerances.
 
-    The second value has, for each chain, the indices of its cubes, lat-longs and octahedral maps. A job has the
+    The second value has, for each chain, the indices of its cubes, lat-longs, octahedral maps and image. A job has the
     smallest tolerance of the chains that need it.
     """
     jobs: list[Job] = []
@@ -207,11 +214,13 @@ def _distinct(
     places: list[tuple[list[int], ...]] = [() for _ in wants]
     for w in sorted(range(len(wants)), key=lambda w: wants[w].recipe.tolerance):
         want = wants[w]
-        placed: tuple[list[int], ...] = ([], [], [])
-        for kind, count in enumerate((want.cubes, want.latlongs, want.octahedral)):
+        placed: tuple[list[int], ...] = ([], [], [], [])
+        for kind, count in enumerate((want.cubes, want.latlongs, want.octahedral, min(want.image, 1))):
             if count == 0:
                 continue
-            for job in chain_jobs(convolver, want.recipe, latlong=kind == 1, octahedral=kind == 2)[:count]:
+            for job in chain_jobs(convolver, want.recipe, latlong=kind in (1, 3), octahedral=kind == 2)[:count]:
+                if kind == 3:
+                    job = replace(job, shape=Shape(True, want.image))
                 lobe = job.lobe and tuple((entry.name, entry.text, *rest) for entry, *rest in job.lobe.summands)
                 key = (lobe, job.shape, job.plan.samples)
                 if key not in known:

@@ -129,7 +129,8 @@ def layout_of(
         return layout
     if stated is not None:
         layout = next(layout for layout in (*LAYOUTS, OPENEXR_CUBE) if layout.name == stated)
-        if width * layout.rows != height * layout.columns and (height, width) != (1, 1):
+        constant = height == width == 1 and not layout.cells
+        if width * layout.rows != height * layout.columns and not constant:
             raise InputError(
                 f"{where} states the layout {stated} (envmap), whose aspect ratio is {layout.columns}:{layout.rows}, "
                 f"but it is {width} x {height}; --layout overrules what it states"
