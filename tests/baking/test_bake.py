@@ -543,7 +543,7 @@ BAD = {
     "text": (3,),
     "truncated": (3,),
     "corrupted": (3,),
-    "corrupted png": (3, "checksum"),
+    "corrupted png": (3, "corrupted"),
     "lying": (3, "200000", "100000"),
     "lying png": (3,),
     "NaN": (3, "nan", "(7, 5)", "--bad-pixels"),
