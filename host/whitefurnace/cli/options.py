@@ -280,7 +280,7 @@ def memory(heading: str = RUNNING) -> Decorator:
         expose_value=False,
         callback=_set_memory,
         heading=heading,
-        help="Memory that reading one file may take, as 4GB or 25%. [default: $WHITEFURNACE_MEMORY, else 512 MiB and "
+        help="Memory that reading one file may take, as 4GB or 25%. [default: $WHITEFURNACE_MEMORY, else 256 MiB and "
         "1024 bytes for each byte of the file, but at most half of the machine's memory]",
     )
 

@@ -16,7 +16,16 @@ from whitefurnace.files.harmonics import read_sh
 from whitefurnace.files.hdr import pack_hdr, unpack_hdr, write_hdr
 from whitefurnace.files.image import Image, check_choice, decode_srgb, read_image, srgb_table
 from whitefurnace.files.inputs import head_of, input_size, inside, is_input, open_input, read_input, read_text
-from whitefurnace.files.lights import Deferred, Light, is_light, light_digest, light_files, read_light, read_radiance
+from whitefurnace.files.lights import (
+    Deferred,
+    Light,
+    is_light,
+    light_digest,
+    light_extent,
+    light_files,
+    read_light,
+    read_radiance,
+)
 from whitefurnace.files.lock import Lock, acquire, is_lock, is_safe, lock_path, locks_in
 from whitefurnace.files.manifest import read_manifest, write_manifest
 from whitefurnace.files.npy import release, scratch, write_npy
@@ -61,6 +70,7 @@ __all__ = [
     "is_safe",
     "is_texture",
     "light_digest",
+    "light_extent",
     "light_files",
     "lock_path",
     "locks_in",

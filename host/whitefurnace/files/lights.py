@@ -194,6 +194,16 @@ class Radiance(NamedTuple):
     turn: float = 0.0
 
 
+def light_extent(path: str | os.PathLike[str]) -> tuple[bool, int, int]:
+    """Return whether the light in a file is a cube, and the rows and columns of level 0; a texture is not decoded.
+
+    Raises the errors of `read_radiance` for what the header says.
+    """
+    light = _single(path)
+    height, width = light.levels[0].shape[-3:-1]
+    return light.cube, height, width
+
+
 def read_radiance(path: str | os.PathLike[str]) -> Radiance:
     """Read level 0 of the light in a file as radiance. The intensity of a light of glTF is applied.
 
@@ -201,6 +211,18 @@ def read_radiance(path: str | os.PathLike[str]) -> Radiance:
     where the package that decodes the format is not installed, and for a light that is turned about another axis than
     +Y.
     """
+    light = _single(path)
+    first = light.levels[0]
+    texels = np.ascontiguousarray(first.decode() if isinstance(first, Deferred) else first)
+    if light.intensity != 1:
+        with np.errstate(over="ignore"):  # what becomes infinite is found as such
+            texels = texels * np.float32(light.intensity)
+    largest = min(light.largest[:3]) * light.intensity
+    return Radiance(texels, light.cube, (*light.notices, *light.said), largest, light.turn or 0.0)
+
+
+def _single(path: str | os.PathLike[str]) -> Light:
+    """Read a light that is an environment: a single cube or image. Raises the errors of `read_radiance`."""
     light = read_light(path)
     if light.layers:
         many = "cubes" if light.cube else "images"
@@ -212,12 +234,7 @@ def read_radiance(path: str | os.PathLike[str]) -> Radiance:
         raise InputError(f"{path} has {first.shape[-1]} channels ({light.format}), 1, 3 or 4 were expected")
     if light.turn is None:
         raise UnsupportedError(f"{path}: its light is rotated about another axis than +Y; give it without a rotation")
-    texels = np.ascontiguousarray(first.decode() if isinstance(first, Deferred) else first)
-    if light.intensity != 1:
-        with np.errstate(over="ignore"):  # what becomes infinite is found as such
-            texels = texels * np.float32(light.intensity)
-    largest = min(light.largest[:3]) * light.intensity
-    return Radiance(texels, light.cube, (*light.notices, *light.said), largest, light.turn)
+    return light
 
 
 def _env(source: Source) -> Light:

@@ -21,8 +21,8 @@ VARIABLE = "WHITEFURNACE_MEMORY"
 SHARE = 0.5
 """Part of the machine's memory that the default limit allows at most."""
 
-FLOOR = 512 << 20
-"""Memory that the default limit allows to a file of any size: a cube of 2048² half floats, decoded, takes 302 MB."""
+FLOOR = 256 << 20
+"""Memory that the default limit allows to a file of any size. A cube of 1024² half floats takes 151 MB."""
 
 RATIO = 1024
 """Bytes of memory that the default limit adds for each byte of a file.
@@ -54,16 +54,17 @@ def require(nbytes: int, what: str, path: str | os.PathLike[str], file_bytes: in
             file_bytes = os.stat(path).st_size
     allowed = limit(file_bytes)
     if nbytes > allowed:
+        has = f" (this machine has {size(machine())})" if nbytes > SHARE * machine() else ""
         raise InputError(
             f"{path}: {what} need {size(nbytes)} of memory, a file of {size(file_bytes)} may take {size(allowed)}; "
-            f"set {VARIABLE} to a larger amount, such as {_suggestion(nbytes)}, to read it all the same"
+            f"set {VARIABLE}={_suggestion(nbytes)} or give --memory {_suggestion(nbytes)} to read it all the same{has}"
         )
 
 
 def limit(file_bytes: int) -> int:
     """Return the bytes of memory that reading a file of `file_bytes` bytes may take.
 
-    It is the amount in `WHITEFURNACE_MEMORY` where that is set; otherwise 512 MiB and 1024 bytes for each byte of the
+    It is the amount in `WHITEFURNACE_MEMORY` where that is set; otherwise 256 MiB and 1024 bytes for each byte of the
     file, but at most half of the machine's memory. Raises `UsageError` for a variable that is not an amount.
     """
     text = os.environ.get(VARIABLE, "").strip()

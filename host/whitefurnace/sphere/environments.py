@@ -25,6 +25,7 @@ from whitefurnace.files import (
     image_facts,
     is_light,
     light_digest,
+    light_extent,
     light_files,
     read_image,
     read_radiance,
@@ -307,10 +308,9 @@ def extent(source: str | os.PathLike[str], reading: Reading | None = None) -> tu
         return "cube", size, size
     stated, aspect = None, 1.0
     if is_light(path):
-        pixels, cube, *_ = read_radiance(path)
+        cube, height, width = light_extent(path)
         if cube:
-            return "cube", pixels.shape[1], pixels.shape[2]
-        height, width = pixels.shape[:2]
+            return "cube", height, width
     else:
         facts = image_facts(path, layer=how.layer, fill=how.fill, light=True)
         height, width, stated, aspect = facts.height, facts.width, facts.layout, facts.aspect
