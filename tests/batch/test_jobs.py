@@ -605,9 +605,11 @@ def died(folder: Path, output: str, count: int, rng: random.Random, times: int) 
     return moments
 
 
+@pytest.mark.long
 @pytest.mark.skipif(os.name != "posix", reason="SIGKILL is POSIX's")
-@pytest.mark.parametrize("times", [2, pytest.param(50, marks=pytest.mark.long)])
+@pytest.mark.parametrize("times", [8])
 def test_killed_at_random_moments(tmp_path, times):
+    """With all that a process of its own does; test_deaths.py has fifty deaths of each command."""
     probes(tmp_path, 6, height=16)
     job(tmp_path, '[[bake]]\nenvironments = ["probes/*"]\noutput = "out"\nsize = 32\nmin_size = 16\n')
     died(tmp_path, "out", 6, random.Random(6 + times), times)

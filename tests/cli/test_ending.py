@@ -31,7 +31,8 @@ def shell_script(text: str, **options) -> subprocess.CompletedProcess[str]:
 
 
 @posix
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+@pytest.mark.few(1)
+@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", ">&-", "2>&-"])
 def test_a_closed_stream_is_the_null_device(tmp_path, device, closed):
     """A file that took the number of a closed stream would have what is printed in it."""
     made = shlex.join(command("lut", "dfg", "-o", tmp_path / "t.npy", "--size", "4", "--force"))
@@ -57,7 +58,8 @@ def test_no_file_takes_the_number_of_a_closed_stream():
 
 
 @posix
-@pytest.mark.parametrize("argv", ["models", "--help", "devices", "models nope --json"])
+@pytest.mark.few(2)
+@pytest.mark.parametrize("argv", ["models", "--help", "models nope --json", "devices"])
 def test_a_broken_pipe_is_quiet(tmp_path, argv):
     """The reader is gone before anything is written; 141 is what shells say of a program that SIGPIPE ended."""
     gone = f"{{ sleep 0.2; {shlex.join(command(*argv.split()))} 2>err; echo $? >code; }} | true; cat code err"
@@ -155,6 +157,18 @@ def test_a_signal_that_the_caller_ignores_is_ignored():
         "assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL\nos._exit(ended)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 143
+
+
+@posix
+def test_a_signal_waits_for_the_end_of_an_import(tmp_path):
+    """An extension module that is interrupted while it starts reports another error, or aborts the process."""
+    (tmp_path / "late.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\nwhole = True\n")
+    code = (
+        "import os, time\nfrom whitefurnace.cli.ending import Ended, listening\ndone = None\n"
+        "try:\n    with listening():\n        import late\n        done = late.whole\n        time.sleep(30)\n"
+        "except Ended as error: os._exit(error.exit_code if done else 1)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=tmp_path, timeout=60).returncode == 143
 
 
 # ---------------------------------------------------------------------------------------------- errors

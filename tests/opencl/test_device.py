@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -228,6 +229,18 @@ def test_the_user_s_own_vendors_are_left_alone(monkeypatch, tmp_path):
     with devices._exposed_runtimes():
         assert os.environ["OCL_ICD_VENDORS"] == "mine"
     assert os.environ["OCL_ICD_VENDORS"] == "mine"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals as POSIX has them")
+def test_ctrl_c_waits_while_pyopencl_starts():
+    """pyopencl's extension aborts the process if a handler raises while it starts."""
+    steps = []
+    with pytest.raises(KeyboardInterrupt):
+        with devices._undisturbed():
+            signal.raise_signal(signal.SIGINT)
+            steps.append("whole")
+        steps.append("never")
+    assert steps == ["whole"] and signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_importing_the_module_does_not_import_pyopencl():

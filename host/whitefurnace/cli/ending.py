@@ -13,6 +13,7 @@ import shlex
 import signal
 import sys
 import tempfile
+import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -86,9 +87,19 @@ SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasat
 
 @contextlib.contextmanager
 def listening() -> Iterator[None]:
-    """Raise `Ended` for SIGTERM and SIGHUP within the `with` block, where the caller does not ignore them."""
+    """Raise `Ended` for SIGTERM and SIGHUP within the `with` block, where the caller does not ignore them.
+
+    During an import the signal waits: an extension module that is interrupted while it starts reports another error.
+    """
+
+    top = sys._getframe(2)
 
     def heard(number: int, frame: FrameType | None) -> None:
+        if _imports(frame, top):
+            again = threading.Timer(0.02, signal.raise_signal, [number])
+            again.daemon = True
+            again.start()
+            return
         for other in SIGNALS:  # a second one would stop the cleaning
             signal.signal(other, signal.SIG_IGN)
         raise Ended(number)
@@ -103,6 +114,15 @@ def listening() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _imports(frame: FrameType | None, top: FrameType) -> bool:
+    """Whether a module is being imported in a frame, or in one that it was called from below `top`."""
+    while frame is not None and frame is not top:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def leave(code: int) -> NoReturn:

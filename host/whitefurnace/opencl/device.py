@@ -11,6 +11,7 @@ import importlib.metadata
 import math
 import os
 import re
+import signal
 import sys
 import tempfile
 import threading
@@ -211,9 +212,11 @@ class _Invokers(dict[Any, Any]):
 def _opencl() -> Any:
     """The pyopencl module; ImportError where it or its OpenCL library cannot be loaded."""
     _refuse_after_fork()
-    import pyopencl
+    if "pyopencl.invoker" in sys.modules:
+        return sys.modules["pyopencl"]
+    with _undisturbed():
+        import pyopencl
 
-    if "pyopencl.invoker" not in sys.modules:
         before = getattr(pyopencl, "_PYOPENCL_NO_CACHE", False)
         pyopencl._PYOPENCL_NO_CACHE = True  # else the import opens the database
         import pyopencl.invoker
@@ -221,6 +224,30 @@ def _opencl() -> Any:
         pyopencl.invoker.invoker_cache = _Invokers()  # type: ignore[assignment]
         pyopencl._PYOPENCL_NO_CACHE = before
     return pyopencl
+
+
+@contextlib.contextmanager
+def _undisturbed() -> Iterator[None]:
+    """Let signals wait until the end of the `with` block.
+
+    What a handler raises while pyopencl's extension starts, as for Ctrl-C, aborts the whole process.
+    """
+    if threading.current_thread() is not threading.main_thread():  # handlers run in the main thread
+        yield
+        return
+    heard: list[int] = []
+    before: dict[int, Any] = {}
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        number = getattr(signal, name, None)
+        if number is not None and callable(signal.getsignal(number)):
+            before[number] = signal.signal(number, lambda number, frame: heard.append(number))
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    for number in heard[:1]:
+        signal.raise_signal(number)
 
 
 _lost: list[Any] | None = None
