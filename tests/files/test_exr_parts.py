@@ -70,7 +70,7 @@ def test_the_first_part_with_colour_is_read_and_named(tmp_path):
     assert environment(path, layer="diffuse").texels.tolist() == OTHER.tolist()
 
 
-@pytest.mark.parametrize("names", ["Z", "normal.XYZ", "A", "UV", "ZA"])
+@pytest.mark.parametrize("names", ["Z", "XYZ", "normal.XYZ", "A", "UV", "ZA"])
 def test_what_is_no_light_is_refused_by_name(tmp_path, names):
     layer, _, channels = names.rpartition(".")
     channels = [f"{layer}.{c}" if layer else c for c in channels]
@@ -150,6 +150,12 @@ def test_a_layer_is_of_openexr_alone(tmp_path):
     output.write_image(np.ones((4, 8, 3), np.uint8))
     output.close()
     refused(path, "not OpenEXR", kind=UsageError, layer="beauty")
+
+
+def test_names_of_channels_may_be_spelled_out_and_small(tmp_path):
+    for names in (("red", "green", "blue"), ("r", "g", "b"), ("beauty.Red", "beauty.Green", "beauty.Blue")):
+        found = read_image(saved(tmp_path, Part(planes(RGB, names))))
+        np.testing.assert_array_equal(found.pixels, RGB.astype(np.float32))
 
 
 # --- windows --------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 
+from exr_writer import Part, exr, planes
 from reference import cube_directions
 from whitefurnace.errors import FileError, InputError, UsageError
 from whitefurnace.files import write_exr
@@ -642,5 +643,40 @@ def test_demo_is_an_environment_wherever_one_is_taken(device, monkeypatch, tmp_p
     assert env.name == "demo" and env.texels.shape == (512, 1024, 3) and env.statistics["max_over_mean"] > 1e5
     assert extent("demo") == ("latlong", 512, 1024) and source_files("demo") == {} and source_name("demo") == "demo"
     assert environment("demo", rotate=90, device=device).rotation == pytest.approx(math.pi / 2)
+    refused(UsageError, "demo", "demo", "layout", layout="latlong")
     write_exr(tmp_path / "demo", np.ones((2, 4, 3), np.float32))
     assert environment("demo").texels.shape == (2, 4, 3)  # a file of that name comes first
+
+
+def test_a_face_that_states_a_layout_is_refused_unless_it_is_called_a_face(tmp_path):
+    faces(tmp_path)
+    attributes = {"envmap": ("envmap", b"\0")}
+    (tmp_path / "ny.exr").write_bytes(exr(Part(planes(np.ones((4, 4, 3), np.float32)), attributes=attributes)))
+    refused(InputError, tmp_path, "ny.exr", "envmap", "--layout faces")
+    assert environment(tmp_path, layout="faces").kind == "cube"
+
+
+@pytest.mark.parametrize("what", ["prefilter", "irradiance", "harmonics", "integrate"])
+def test_every_function_reads_an_environment_alike(tmp_path, device, what):
+    """The options of reading in each function of Python, and its notices."""
+    import whitefurnace as wf
+
+    pixels = np.ones((4, 8, 3), np.float32)
+    other = pixels.copy()
+    other[1, 2, 0] = np.inf
+    path = tmp_path / "a.exr"
+    path.write_bytes(exr(Part(planes(pixels), "one"), Part(planes(other), "two", window=(0, 0), display=(0, 0, 7, 3))))
+    options = {"layer": "two", "layout": "latlong", "fill": "black", "device": device}
+    if what == "integrate":
+        options |= {"diffuse": "lambert", "albedo": 0.5, "NoV": 0.5, "environment": path}
+        arguments = ("radiance",)
+    else:
+        options |= {"size": 4} if what == "irradiance" else {"size": 8, "min_size": 8} if what == "prefilter" else {}
+        arguments = (path,)
+    function = getattr(wf, what)
+    with pytest.raises(InputError, match="--bad-pixels clamp"):
+        function(*arguments, **options)
+    for mode in ({"bad_pixels": "zero"}, {"nonfinite": "zero"}):
+        found = function(*arguments, **options, **mode)
+        assert any("part two was read" in notice for notice in found.notices)
+        assert any("1 not finite value was set to 0" in notice for notice in found.notices)

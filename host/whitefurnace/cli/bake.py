@@ -49,8 +49,9 @@ OUTPUT, ACCURACY, ENVIRONMENT, LIGHT = "Output", "Accuracy", "Environment", "Sun
     metavar="N",
     type=int,
     heading=OUTPUT,
-    help="Edge of a cube face of the first level in texels, a power of two from 1 to 2048. [default: 256, "
-    "or the engine's]",
+    help="Edge of a cube face of the first level in texels, a power of two from 1 to 2048. An engine that filters an "
+    "image itself gets one of 4 N columns, and without this option one of the size of the source. [default: 256, or "
+    "the engine's]",
 )
 @options.option(
     "--min-size",

@@ -41,6 +41,7 @@ _DATA = re.compile(
 )
 # Names of a channel that holds grey radiance where it is alone.
 _GREY = ("Y", "L", "I", "R", "GREY", "GRAY", "LUMINANCE", "INTENSITY", "RADIANCE", "")
+_SPELLED = {"RED": "R", "GREEN": "G", "BLUE": "B", "ALPHA": "A"}
 _SHOWN = 8
 _NAMED = 100
 _LONGEST = 50
@@ -93,7 +94,7 @@ class _Layer:
 
     @property
     def grey(self) -> bool:
-        if "RY" in self.names or "BY" in self.names:
+        if {"RY", "BY", "X"} & self.names.keys():  # chroma, or a vector
             return False
         return "Y" in self.names or (len(self.names) == 1 and next(iter(self.names)) in _GREY)
 
@@ -169,7 +170,8 @@ def _layers(number: int, part: Part) -> list[_Layer]:
     found: dict[str, dict[str, str]] = {}
     for channel in part.channels:
         layer, _, leaf = channel.name.rpartition(".")
-        found.setdefault(layer, {}).setdefault(leaf.upper(), channel.name)
+        short = _SPELLED.get(leaf.upper(), leaf.upper())
+        found.setdefault(layer, {}).setdefault(short, channel.name)
     return [_Layer(number, part, layer, names) for layer, names in found.items()]
 
 

@@ -195,6 +195,8 @@ def read_environment(
     if is_demo(source):
         from whitefurnace.opencl.device import choose_device
 
+        if reading.layout is not None or reading.layer is not None:
+            raise UsageError("the built-in environment demo is no file, and has no layout and no layer to choose")
         source = demo(choose_device(device) if device is None or isinstance(device, str) else device)
     if reading.layer is not None and not isinstance(source, (str, os.PathLike)):
         raise UsageError(f"layer {reading.layer!r} is of an OpenEXR file, and the source is none")
@@ -422,6 +424,11 @@ def _from_six(source: Path, paths: list[Path], name: str, reading: Reading) -> E
             )
         if image.aspect != 1:
             raise InputError(f"{path} states a pixel aspect ratio of {image.aspect:g}, pixels of cube faces are square")
+        if image.layout is not None and reading.layout != SIX_FACES:
+            raise InputError(
+                f"{path} states the layout {image.layout} (envmap), but it is one of six faces; --layout faces reads "
+                "it all the same"
+            )
         notices += image.notices
         images.append(image)
     channels = 4 if any(image.pixels.shape[2] == 4 for image in images) else 3
