@@ -24,6 +24,12 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
+def shortened(text: str, most: int = 400) -> str:
+    """Return a text on one line with its middle left out where it has more than `most` characters."""
+    text = printable(text)
+    return text if len(text) <= most else f"{text[: most // 2]} … {text[-most // 3 :]}"
+
+
 def size(nbytes: float) -> str:
     """A number of bytes as text with three digits and a decimal unit: 12 B, 3.4 KB, 56.7 MB, 8.9 GB."""
     for unit in ("B", "KB", "MB"):

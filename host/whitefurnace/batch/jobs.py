@@ -30,6 +30,7 @@ from whitefurnace.baking.request import BakeRequest
 from whitefurnace.batch import pool
 from whitefurnace.catalogue.choice import file_of
 from whitefurnace.catalogue.user import user_files
+from whitefurnace.engines.presets import user_engine
 from whitefurnace.errors import FileError, InputError, UsageError, WhitefurnaceError, code_of, nearest
 from whitefurnace.files import (
     FileOutput,
@@ -496,7 +497,10 @@ class _Maker:
             recipe = self._recipe(some)
             return recipe, _bake_plan(recipe, str(output or self.root), self.force)
 
-        planned = self._planned(place, options, plan)
+        broken = any(map(_is_broken, files))
+        if broken:
+            refused.add("for_")
+        planned = self._planned(place, {name: o for name, o in options.items() if name not in refused}, plan)
         sources: dict[str, None] = {}
         for k, pattern in enumerate(table.environments):
             if pattern == MISSING:
@@ -516,6 +520,8 @@ class _Maker:
         recipe, order = planned
         # Every file name contains the stem, so the files of one item give the files of each.
         relative = [os.path.relpath(t.path, output) for t in baking.targets_of(order, _STEM)] + [f"{_STEM}.json"]
+        if broken:  # these items fail when they run, and the others do not
+            recipe, relative = _encoded(options, {}), [f"{_STEM}.json"]
         for one in relative:
             self._into((output / one).parent)
         for source in sources if table.layout not in (None, SIX_FACES) else without_repeats(sources):
@@ -781,6 +787,19 @@ def named_files(options: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
     if (environment := options.get("environment")) and not is_demo(environment):
         found[environment] = source_files(environment, options.get("layout"))
     return found
+
+
+def _is_broken(name: str) -> bool:
+    """Return whether a file is the description of an engine and is not valid; False where it cannot be read."""
+    if not name.lower().endswith(".toml"):
+        return False
+    try:
+        user_engine(name)
+    except InputError:
+        return True
+    except WhitefurnaceError:
+        pass
+    return False
 
 
 def _encoded(options: Mapping[str, Any], files: Mapping[str, Mapping[str, Path]]) -> str:

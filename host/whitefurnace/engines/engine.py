@@ -13,11 +13,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+import numpy as np
 
 from whitefurnace.catalogue import models
 from whitefurnace.errors import UsageError, nearest
 from whitefurnace.expression import Expression, table_text
-from whitefurnace.prefiltering.recipe import LOD_NAMES, Lods
+from whitefurnace.prefiltering.recipe import LOD_NAMES, SIZE_RANGE, Lods
 
 Holds = Literal["specular", "skybox", "irradiance", "sheen", "environment", "sh", "dfg"]
 
@@ -63,6 +64,10 @@ SH_SCALES: dict[str, str] = {
 }
 
 STORED_NAME = re.compile(r"\{stem\}[A-Za-z0-9_.-]*")
+
+
+ROUNDING = 1e-2
+"""How far a share may lie outside [0, 1]: that of Babylon.js is α + 0.0005."""
 
 
 class File(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -343,10 +348,16 @@ def check(engine: Engine) -> None:
     for low, high, what, value in (
         (1, 4096, "dfg.size", engine.dfg.size),
         (0, 1, "least", engine.least),
-        (1, 16, "levels", engine.levels or 1),
+        (1, 16, "levels", 1 if engine.levels is None else engine.levels),
+        (*SIZE_RANGE, "size", engine.size),
+        (*SIZE_RANGE, "min_size", engine.min_size),
     ):
         if not low <= value <= high:
             raise UsageError(f"{what} {value} is outside [{low}, {high}]")
+    for what in ("size", "min_size"):
+        if (value := getattr(engine, what)) & (value - 1):
+            raise UsageError(f"{what} {value} is not a power of two")
+    _check_formulas(engine)
     if (engine.dfg.x == "NoV") == (engine.dfg.y == "NoV"):
         raise UsageError(f"dfg has x = {engine.dfg.x} and y = {engine.dfg.y}; one of them must be NoV, the other not")
     if engine.dfg.charlie_masking not in models("masking"):
@@ -365,6 +376,20 @@ def check(engine: Engine) -> None:
             raise UsageError(f"{where}: {file.name} is written twice")
         seen.add(file.name)
         _check_file(engine, file, where)
+
+
+def _check_formulas(engine: Engine) -> None:
+    """Check the values of an engine's formulas over all roughness values. Raises UsageError."""
+    r = np.linspace(0, 1, 257)
+    for what, formula in (("bend", engine.bend_formula), ("blend", engine.blend_formula)):
+        values = np.broadcast_to(formula(r=r, alpha=r * r), r.shape)
+        for bad in np.flatnonzero(~((values >= -ROUNDING) & (values <= 1 + ROUNDING)))[:1]:
+            raise UsageError(f"{what} is {values[bad]:g} at r = {r[bad]:g}, a share in [0, 1] was expected")
+    sizes = {"max_lod": 4.0, "width": 256.0}  # any that an engine may have
+    lods = np.broadcast_to(engine.lod_formula(r=r, alpha=r * r, **sizes), r.shape)
+    # At r = 0 a logarithm is −∞, which is read at level 0.
+    for bad in np.flatnonzero(~np.isfinite(lods) & ((r > 0) | (lods != -np.inf)))[:1]:
+        raise UsageError(f"lod is {lods[bad]:g} at r = {r[bad]:g}, a level was expected")
 
 
 def _check_file(engine: Engine, file: File, where: str) -> None:

@@ -34,6 +34,7 @@ from whitefurnace.engines.engine import (
 )
 from whitefurnace.errors import InputError, UsageError, nearest
 from whitefurnace.files import read_text
+from whitefurnace.text import shortened
 
 
 def _presets() -> dict[str, Preset]:
@@ -110,24 +111,24 @@ def user_engine(path: str | os.PathLike[str]) -> Engine:
     try:
         data = tomllib.loads(read_text(path, "the description of an engine", most=MOST_BYTES))
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InputError(f"{path} is not TOML: {error}") from None
+        raise InputError(f"{path} is not TOML: {shortened(str(error))}") from None
     for key in ("name", "proven", "container", "latlong", "without", "facts"):
         if key in data:
             raise InputError(f"{path}: {key} cannot be given; the name is the file's stem")
     for where, given, known in _tables(data):
         for key in given:
             if key not in known:
-                raise InputError(f"{path}: {where}{key} is not known{nearest(key, known)}")
+                raise InputError(f"{path}: {where}{shortened(key, 60)} is not known{nearest(key, known)}")
     try:
         engine = msgspec.convert({**data, "name": path.stem, "facts": f"given in {path.name}"}, Engine)
     except msgspec.ValidationError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{path}: {shortened(str(error))}") from None
     try:
         if engine.name in ENGINES:
             raise UsageError(f"{engine.name} is the name of a preset; rename the file")
         check(engine)
     except UsageError as error:
-        raise InputError(f"{path}: {error}") from None
+        raise InputError(f"{path}: {shortened(str(error))}") from None
     return engine
 
 
