@@ -439,14 +439,14 @@ def test_the_background_is_what_a_camera_sees(tmp_path):
     [
         ({"for_": "three"}, UsageError, "was not baked for three; it has filament, godot"),
         ({"for_": "filement"}, UsageError, "did you mean 'filament'"),
-        ({"for_": "godot"}, UnsupportedError, "there is no prefiltered chain"),
+        ({"for_": "godot"}, UnsupportedError, "no prefiltered chain"),
         ({"for_": "filament,godot"}, UsageError, "a picture is of one"),
         ({"size": 7}, UsageError, r"size 7 is outside \[8, 2048\]"),
         ({"columns": 0}, UsageError, "columns 0 is outside"),
         ({"size": 2048, "columns": 64, "rows": 64}, UsageError, "are more than"),
         ({"exposure": math.nan}, UsageError, "exposure nan is outside"),
         ({"base_color": (0.5, 2.0, 0.5)}, UsageError, "base color 0.5 2 0.5 is not"),
-        ({"background": "sky"}, UsageError, "neither environment nor plain"),
+        ({"background": "sky"}, UsageError, "unknown background"),
     ],
 )
 def test_what_cannot_be_drawn_is_said(baked, tmp_path, options, error, said):
