@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import random
+import shutil
 import struct
+import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -208,6 +211,9 @@ def pattern(d):
     return np.stack([1 + 0.8 * x + 0.1 * y, 1 + 0.8 * y + 0.1 * z, 1 + 0.8 * z + 0.1 * x], -1)
 
 
+LATLONG = {"envmap": ("envmap", b"\0")}
+
+
 def openexr_cube(n):
     """The directions, in OpenEXR's x, y, z, of texel centres of six faces as `CubeMap::direction` and
     `CubeMap::pixelPosition` of ImfEnvmap.cpp place them."""
@@ -249,6 +255,22 @@ def test_a_cube_of_openexr_is_read_by_its_convention(tmp_path):
     assert environment(path, layout="column").layout == "vertical strip"
 
 
+@pytest.mark.skipif(shutil.which("exrenvmap") is None, reason="exrenvmap is not installed (Debian's openexr)")
+def test_a_cube_that_openexr_s_own_tool_makes_of_a_latlong_is_the_same_environment(tmp_path):
+    h, w, n = 64, 128, 32
+    v, u = np.meshgrid((np.arange(h) + 0.5) / h, (np.arange(w) + 0.5) / w, indexing="ij")
+    ring, azimuth = np.sin(np.pi * v), 2 * np.pi * (u - 0.5)
+    directions = np.stack([ring * np.cos(azimuth), np.cos(np.pi * v), ring * np.sin(azimuth)], -1)
+    source = saved(tmp_path, Part(planes(pattern(directions).astype(np.float32)), attributes=LATLONG))
+    cube = tmp_path / "cube.exr"
+    subprocess.run(["exrenvmap", "-c", "-w", str(n), source, cube], check=True)
+    env = environment(cube)
+    assert env.layout == "openexr cube"
+    # The tool places pixel centres on the edges of both maps: half a texel of 2/n, along which the pattern changes by
+    # .8 at most.
+    assert np.abs(env.texels - pattern(cube_directions(n))).mean() < 0.8 * 0.5 * 2 / n
+
+
 def test_a_latlong_of_openexr_is_a_latlong(tmp_path):
     path = saved(tmp_path, Part(planes(RGB), attributes={"envmap": ("envmap", b"\0")}))
     env = environment(path)
@@ -280,6 +302,16 @@ def test_an_environment_map_is_its_data_window(tmp_path):
     )
     np.testing.assert_array_equal(environment(path).texels, RGB.astype(np.float32))
     assert extent(path) == ("latlong", 4, 8)
+
+
+WORLDS = sorted(Path("/usr/share/blender/datafiles/studiolights/world").glob("*.exr"))
+
+
+@pytest.mark.skipif(not WORLDS, reason="the HDRIs of Blender are not installed (Debian's blender-data)")
+def test_published_hdris_with_a_few_negatives_are_environments():
+    for path in WORLDS:
+        env = environment(path)
+        assert env.texels.min() == 0 and any("negative value" in notice for notice in env.notices), path.name
 
 
 # --- other attributes -----------------------------------------------------------------------------------
