@@ -670,3 +670,11 @@ def test_an_envmap_attribute_is_shown(tmp_path):
         pixels = np.ones((*shape, 3), np.float32)
         path.write_bytes(exr(Part(planes(pixels), attributes={"envmap": ("envmap", bytes([kind]))})))
         assert said in shown(path)
+
+
+@pytest.mark.parametrize("number", ["1" + "0" * 400, "1e999", "NaN", '"x"', "[1]", "null", "{}"])
+def test_harmonics_of_any_numbers_are_one_sentence(tmp_path, shell, number):
+    """An integer of 400 digits has no float."""
+    rows = ",".join(f'"L{k}": [1, 2, {number if k == 4 else 3}]' for k in range(9))
+    (tmp_path / "a_sh.json").write_text("{" + rows + "}")
+    assert shell("inspect", tmp_path / "a_sh.json") == 3 and shell.sentence()

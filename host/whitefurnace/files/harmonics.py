@@ -37,7 +37,7 @@ def read_sh(path: str | os.PathLike[str]) -> npt.NDArray[np.float64]:
         else:
             lines = (line.partition("//")[0] for line in text.splitlines())
             rows = [[float(x) for x in _NUMBER.findall(line)] for line in lines if line.strip()]
-    except (ValueError, TypeError, AttributeError, RecursionError):
+    except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         raise source.wrong("it is no text of numbers") from None
     if len(rows) != 9 or any(len(row) != 3 or not all(map(math.isfinite, row)) for row in rows):
         raise source.wrong("it does not hold nine rows of three finite numbers")
