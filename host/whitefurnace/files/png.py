@@ -19,8 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import FileError, InputError
+from whitefurnace.files import memory
 from whitefurnace.files.atomic import Transaction, write_pieces
 from whitefurnace.files.binary import Buffer, Source
+from whitefurnace.files.zstd import DEFLATE_RATIO, inflate
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_SIDE = 32768
@@ -28,9 +30,6 @@ Pixels = npt.NDArray[np.uint8]
 
 _HEADER = struct.Struct(">2I5B")
 _RGB, _RGBA = 2, 6  # colour types [PNG 3, 11.2.1]
-_PIECE = 1 << 20
-# Deflate packs at most 258 bytes into two bits, 1032 : 1 [RFC 1951, 3.2.5].
-_MAX_RATIO = 1032
 
 
 def encode_png(pixels: npt.NDArray[Any], *, srgb: bool = False, effort: int = 9) -> bytes:
@@ -177,9 +176,10 @@ def _checked(source: Source, side: int | None) -> tuple[int, int, int, bytes]:
     data = b"".join(packed)
     row = 1 + width * channels
     wanted = height * row
-    if wanted > _MAX_RATIO * len(data) + 64:
+    if wanted > DEFLATE_RATIO * len(data):
         raise source.wrong(f"its header describes {width} x {height} pixels, {len(data)} bytes cannot hold so many")
-    rows = _inflated(source, data, wanted)
+    memory.require(2 * len(source) + wanted, f"its {width} x {height} pixels", source.name, len(source))
+    rows = inflate(data, wanted, source, "its image data", needs="its header needs", rest=True)
     if max(rows[::row]) > 4:
         raise source.wrong("a row has a filter that PNG does not know")
     return width, height, channels, data
@@ -197,26 +197,6 @@ def _size(source: Source, body: memoryview, side: int | None) -> tuple[int, int,
             f"8 bits of RGB (2) or RGBA (6), not interlaced, are read"
         )
     return width, height, 4 if colour == _RGBA else 3
-
-
-def _inflated(source: Source, data: bytes, wanted: int) -> bytearray:
-    """Inflate `data` to exactly `wanted` bytes, piece by piece, so that memory grows only with the output."""
-    inflate, out, left = zlib.decompressobj(), bytearray(), data
-    try:
-        while not inflate.eof and len(out) <= wanted:
-            piece = inflate.decompress(left, min(_PIECE, wanted + 1 - len(out)))
-            left = inflate.unconsumed_tail
-            if not piece and not left:
-                break
-            out += piece
-    except zlib.error as error:
-        raise source.wrong(f"its pixels cannot be inflated ({error})") from error
-    if len(out) != wanted or not inflate.eof:
-        raise source.wrong(
-            f"its pixels inflate to {'more than ' if len(out) > wanted else ''}{min(len(out), wanted)} "
-            f"bytes, its header needs {wanted}{'' if inflate.eof else ' and an end'}"
-        )
-    return out
 
 
 def _chunks(source: Source) -> Iterator[tuple[bytes, memoryview]]:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from whitefurnace.errors import FileError, InputError
-from whitefurnace.files import image
+from whitefurnace.files import image, memory
 from whitefurnace.files.binary import load
 from whitefurnace.files.packing import unpack
 from whitefurnace.files.png import decode_png
@@ -75,6 +75,8 @@ def read_rgbd(path: str | os.PathLike[str]) -> npt.NDArray[np.float32]:
     pixels = decode_png(source)
     if pixels.shape[2] != 4:
         raise source.wrong("it has no alpha, in which RGBD has its divisor")
+    # Four codes of a byte each become three floats of four.
+    memory.require(len(source) + 4 * pixels.nbytes, "its colours as floats", path, len(source))
     return unpack("rgbd", pixels, pixels.shape[:2])
 
 

@@ -61,11 +61,13 @@ DEFLATE_RATIO = 1032
 """Deflate packs at most 258 bytes into two bits [RFC 1951, 3.2.5]."""
 
 
-def inflate(data: Buffer, size: int, source: Source, what: str) -> bytearray:
+def inflate(
+    data: Buffer, size: int, source: Source, what: str, *, needs: str = "its level has", rest: bool = False
+) -> bytearray:
     """Unpack the ZLIB stream `data`, which must hold exactly `size` bytes and an end.
 
-    Memory grows with the output, piece by piece, to no more than `size`. Raises `InputError`, which names `what` of
-    `source`.
+    needs: what states the size, for messages. rest: whether bytes may follow the end. Memory grows with the output,
+    piece by piece, to no more than `size`. Raises `InputError`, which names `what` of `source`.
     """
     if size > len(data) * DEFLATE_RATIO:
         raise source.wrong(f"{what} cannot hold {size} bytes in {len(data)}, ZLIB packs at most 1 : {DEFLATE_RATIO}")
@@ -86,7 +88,7 @@ def inflate(data: Buffer, size: int, source: Source, what: str) -> bytearray:
     if len(out) != size or not unpacker.eof:
         beyond = "more than " if len(out) > size else ""
         end = "" if unpacker.eof or len(out) > size else " and an end"
-        raise source.wrong(f"{what} unpacks to {beyond}{min(len(out), size)} bytes, its level has {size}{end}")
-    if unused := len(unpacker.unused_data) + max(len(data) - at - _PIECE, 0):
+        raise source.wrong(f"{what} unpacks to {beyond}{min(len(out), size)} bytes, {needs} {size}{end}")
+    if not rest and (unused := len(unpacker.unused_data) + max(len(data) - at - _PIECE, 0)):
         raise source.wrong(f"{what} has {unused} bytes after the end of its ZLIB stream")
     return out
