@@ -1065,3 +1065,15 @@ def test_six_files_of_a_shell_pattern_are_one_environment(tmp_path, shell):
     assert verified(tmp_path / "out", "m0")["source"]["layout"] == "six faces"
     assert shell("bake", files[3], "-o", tmp_path / "out", *SMALL) == 0 and "m0: up to date" in shell.out
     assert shell("bake", tmp_path / "m0_*.exr", "-o", tmp_path / "out", *SMALL) == 0 and "m0: up to date" in shell.out
+
+
+@pytest.mark.parametrize("options", [(), ("--force",), ("--dry-run",)])
+def test_an_engine_s_folder_that_is_a_link_to_elsewhere_is_refused(tmp_path, shell, options):
+    """`batch` refuses it too: what it would write lands in a folder that nobody named."""
+    path = image(tmp_path / "a.exr", noise())
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "raw").symlink_to(tmp_path / "elsewhere")
+    assert shell("bake", path, "-o", tmp_path / "out", *SMALL, *options) == 2
+    assert "raw is a link that leads out of" in shell.sentence()
+    assert tree(tmp_path / "elsewhere") == {} == tree(tmp_path / "out")

@@ -227,6 +227,33 @@ def test_ktx2_of_zlib_is_read(form):
     same(ktx2.parse_ktx2(Source(by_zlib(texture), "a")), texture)
 
 
+def test_levels_of_ktx2_may_stand_in_any_order():
+    """The index says where each is; ours stand from the smallest to the largest."""
+    texture = made("rgba16f")
+    data = ktx2.ktx2_bytes(texture)
+    at = min(struct.unpack_from("<Q", data, 80 + 24 * k)[0] for k in range(4))
+    for order in ((0, 1, 2, 3), (2, 0, 3, 1)):
+        out = bytearray(data[:at])
+        for k in order:
+            struct.pack_into("<Q", out, 80 + 24 * k, len(out))
+            out += texture.levels[k]
+        same(ktx2.parse_ktx2(Source(bytes(out), "a")), texture)
+
+
+def test_a_level_is_unpacked_when_it_is_asked_for():
+    """A damaged last level does not keep the first from being read, and is found when it is."""
+    texture = made("rgba16f")
+    data = bytearray(ktx2.ktx2_bytes(texture, zstd=3))
+    offset, length, _ = struct.unpack_from("<3Q", data, 80 + 24 * 3)
+    data[offset : offset + length] = bytes(length)
+    levels = ktx2.parse_ktx2(Source(bytes(data), "a")).levels
+    assert bytes(levels[0]) == texture.levels[0] and len(levels) == 4
+    with pytest.raises(InputError, match="level 3 cannot be unpacked by Zstandard"):
+        levels[3]
+    with pytest.raises(IndexError):
+        levels[4]
+
+
 def test_lies_of_zlib_are_found():
     texture = Texture("rgba16f", 64, 64, (bytes(64 * 64 * 8),))
     data = by_zlib(texture)
