@@ -76,7 +76,7 @@ def used(path: Path) -> None:
 
 
 @pytest.mark.parametrize("document", [CUBES, MAPS], ids=["cubes", "maps"])
-@pytest.mark.parametrize("count", [120, pytest.param(700, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [40, pytest.param(250, marks=pytest.mark.long)])
 @pytest.mark.whole
 def test_a_value_of_any_kind_in_any_field_is_read_or_refused(tmp_path, document, count):
     """`count` of the files in which one value is replaced by another, and as many with several."""

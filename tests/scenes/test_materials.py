@@ -907,9 +907,9 @@ def test_anything_at_all_is_read_or_refused(tmp_path, count):
     assert refused > count / 3 and peak < 100e6, (refused, peak)  # the file itself is 10 kB
 
 
-@pytest.mark.parametrize("count", [600, pytest.param(0, marks=pytest.mark.long)])
+@pytest.mark.parametrize("count", [250, pytest.param(4000, marks=pytest.mark.long)])
 def test_a_value_of_any_type_anywhere_in_a_glTF_is_read_or_refused(tmp_path, count):
-    """Every value is replaced by one of every type; `count` of these files, or all of them for 0."""
+    """Every value is replaced by one of every type; `count` of these files."""
     doc = with_everything()
     doc["nodes"][0]["extensions"] = {"KHR_lights_punctual": {"light": 0}}
     doc["meshes"][0]["primitives"][0]["extensions"] = {"KHR_materials_variants": {"mappings": [{"material": 0}]}}
@@ -921,9 +921,7 @@ def test_a_value_of_any_type_anywhere_in_a_glTF_is_read_or_refused(tmp_path, cou
     doc["buffers"].append({"byteLength": len(data), "uri": uri(data)})
     doc["extensionsRequired"] = ["KHR_texture_transform"]
     read_scene(written(tmp_path / "whole.gltf", doc))
-    changes = every(doc)
-    if count:
-        changes = random.Random(6).sample(changes, count)
+    changes = random.Random(6).sample(every(doc), count)
     refused, wrong, file = 0, [], tmp_path / "s.gltf"
     for path, value in changes:
         made = with_value(doc, path, value)

@@ -51,6 +51,7 @@ from whitefurnace.sphere.layouts import SIX_FACES
 from whitefurnace.tables import lut as tables
 from whitefurnace.tables.axes import named, named_axes
 from whitefurnace.tables.request import TableRequest
+from whitefurnace.text import shortened
 
 MOST_BYTES = 16 << 20
 """Largest size of a job file; ten thousand paths take about one megabyte."""
@@ -339,7 +340,7 @@ def _raise_all(path: Path, wrong: Sequence[str]) -> None:
     """Raise InputError with all mistakes of a job, if there are any."""
     if wrong:
         more = f"; and {len(wrong) - MOST_REPORTED} more" if len(wrong) > MOST_REPORTED else ""
-        raise InputError(f"{path}: {'; '.join(wrong[:MOST_REPORTED])}{more}")
+        raise InputError(f"{path}: {'; '.join(shortened(one, 600) for one in wrong[:MOST_REPORTED])}{more}")
 
 
 def _converted(kind: type[Bake] | type[Lut], entry: dict[str, Any], place: str, wrong: list[str]) -> Bake | Lut | None:
@@ -397,7 +398,7 @@ class _Maker:
         self.folders: set[Path] = set()  # every folder that is written to, and their parents below the root
 
     def job(self) -> Job:
-        missing = sorted((folder for folder in self.folders if not folder.exists()), reverse=True)
+        missing = sorted((folder for folder in self.folders if not os.path.exists(folder)), reverse=True)
         return Job(
             self.path, self.root, tuple(self.items), tuple(self.named), tuple(self.finder.looked), tuple(missing)
         )

@@ -117,7 +117,7 @@ def _with_includes(path: Path, folder: Path, files: list[Path], within: tuple[Pa
             raise InputError(f"{path}:{line}: {quoted[1]!r} includes itself")
         if len(files) > MOST_INCLUDES:
             raise InputError(f"{path}:{line}: more than {MOST_INCLUDES} files are included")
-        if not there.exists():
+        if not os.path.exists(there):
             raise FileError(f"{path}:{line}: {quoted[1]!r} is not found in the folder of this file")
         body = _with_includes(there, folder, files, (*within, path))
         pieces.append(
