@@ -44,7 +44,7 @@ def statement(
     weight[:uniform] *= outside * (total - len(sample[1])) / max(int(outside.sum()), 1)
     energy = float((weight[:, None] * reference**2).sum())
     rmse = math.sqrt(float((weight[:, None] * difference**2).sum()) / energy) if energy > 0 else 0.0
-    if not np.isfinite(errors).all():
+    if not (np.isfinite(errors).all() and math.isfinite(mean)):  # a texel outside the sample shows in the mean
         return math.inf, math.inf, math.inf
     largest = np.sort(errors[:uniform])[::-1]
     return float(largest[rank(uniform) if uniform < total else 0]), float(errors.max()), rmse

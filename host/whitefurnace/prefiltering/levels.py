@@ -10,11 +10,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from whitefurnace.errors import CheckError
+from whitefurnace.errors import CheckError, DeviceError
 from whitefurnace.prefiltering import plan as planning
 from whitefurnace.prefiltering.certificate import statement
 from whitefurnace.prefiltering.convolution import EXACT_SHARE, ROUNDING, Convolver, Level
 from whitefurnace.prefiltering.importance import Sampler
+from whitefurnace.prefiltering.independent import wrong_result
 from whitefurnace.prefiltering.jobs import Job
 from whitefurnace.prefiltering.recipe import CERTIFIED
 from whitefurnace.prefiltering.references import Reference, references_of
@@ -59,7 +60,8 @@ def run_jobs(
     tolerance: bound on `error` of every level. certify: number of uniform texels of each certificate; 0 for none, then
     `error`, `worst` and `rmse` are NaN and nothing is refined. clock: gets the time spent.
 
-    Raises CheckError when a level misses the tolerance and finer grids do not help. A level by importance sampling
+    Raises CheckError when a level misses the tolerance and finer grids do not help, or DeviceError if that is because
+    the device computes wrongly. A level by importance sampling
     keeps the number of samples that was asked for, and states its error.
     """
     clock = clock or Clock()
@@ -124,6 +126,13 @@ def _finished(convolver: Convolver, task: _Task, tolerance: float, clock: Clock)
                 if job.lobe is None
                 else " of ".join([job.lobe.name, *(entry.name for entry, *_ in job.lobe.summands[:1])])
             )
+            wrong = wrong_result(convolver, job, texels, task.reference, tolerance)
+            if wrong:
+                device = convolver.device
+                raise DeviceError(
+                    f"{device.name} ({device.platform}, driver {device.driver}) computes wrongly: {wrong}, in level "
+                    f"{name}; try another driver or --device"
+                )
             raise CheckError(
                 f"level {name} of {'×'.join(map(str, job.shape.dims))} texels has an error of "
                 f"{level.error:.2g}, over the tolerance {tolerance:g}, and finer grids do not help"
