@@ -5,7 +5,8 @@ Reflected radiance needs image readers, so its module is imported at its first u
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -95,12 +96,26 @@ def integrate(
     accuracy["relative_tolerance"] = relative_tolerance
     course: dict[str, Any] = {"device": device, "out": out, "out_errors": out_errors, "progress": progress}
     lit: dict[str, Any] = {"light": light, "environment": environment, "normal": normal}
-    if name != "radiance":
-        if wrong := [key for key, value in lit.items() if value is not None]:
-            raise UsageError(f"integral {name} has no {wrong[0]}; integral radiance has")
-        return run.integrate(name, **models, **accuracy, **course, **parameters)
     given = (rotate, exposure, bad_pixels, layout, layer, fill, nonfinite)
+    if name != "radiance":
+        _refuse_lit(name, lit, given)
+        return run.integrate(name, **models, **accuracy, **course, **parameters)
     return _radiance(given, **lit, **models, **accuracy, **course, **parameters)
+
+
+_READING = {
+    name: inspect.signature(integrate).parameters[name].default
+    for name in ("rotate", "exposure", "bad_pixels", "layout", "layer", "fill", "nonfinite")
+}
+"""How an environment is read unless it is said, in the order of `_radiance`."""
+
+
+def _refuse_lit(name: str, lit: Mapping[str, Any], reading: tuple[Any, ...]) -> None:
+    """Refuse the light, or options of reading an environment, for an integral that has none."""
+    wrong = [key for key, value in lit.items() if value is not None]
+    wrong += [key for key, value in zip(_READING, reading, strict=True) if value != _READING[key]]
+    if wrong:
+        raise UsageError(f"integral {name} has no {wrong[0]}; integral radiance has")
 
 
 def _radiance(given: tuple[Any, ...], **others: Any) -> Integrated:

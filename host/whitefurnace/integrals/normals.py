@@ -41,6 +41,8 @@ def sample(
     """
     choice = chosen("ndf", ndf)
     entry = choice.model
+    if precision not in (32, 64):
+        raise UsageError(f"precision {precision} is not one of 32, 64")
     if not 1 <= count <= 1 << 28:
         raise UsageError(f"count {count} is outside [1, {1 << 28}]")
     given: dict[str, Any] = {

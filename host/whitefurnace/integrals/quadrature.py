@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import inspect
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -268,6 +268,23 @@ def _refuse_lit(entry: Integral) -> None:
         raise UsageError("integral radiance needs a light or an environment: whitefurnace.integrate takes them")
 
 
+USUAL = {"masking": "smith", "fresnel": "one"}
+"""Models of the slots that have one where none is given."""
+
+
+def refuse_unused(given: Mapping[str, Spec], used: Collection[str], why: str) -> None:
+    """Refuse models that an integral would ignore. The usual ones are left out in silence.
+
+    given: models by slot, of masking and fresnel. used: slots that count. why: begins the message. Raises UsageError.
+    """
+    for slot, spec in given.items():
+        if slot in used or (isinstance(spec, str) and spec == USUAL[slot]):
+            continue
+        choice = chosen(slot, spec)
+        if choice.given or choice.model is not model(slot, USUAL[slot]):
+            raise UsageError(f"{why}: leave out the {slot} {choice.model.name}")
+
+
 def slots_of(
     entry: Integral, ndf: Spec | None, masking: Spec, fresnel: Spec, diffuse: Spec | None, brdf: Spec | None
 ) -> dict[str, Chosen]:
@@ -283,11 +300,14 @@ def slots_of(
     if brdf is not None:
         if ndf is not None or diffuse is not None:
             raise UsageError("a brdf is whole: give it without an ndf and a diffuse model")
+        refuse_unused({"masking": masking, "fresnel": fresnel}, (), "a brdf is whole")
         return {"brdf": chosen("brdf", brdf)}
     slots: dict[str, Chosen] = {}
     if ndf is not None:
         asked: dict[str, Spec] = {"ndf": ndf, "masking": masking, "fresnel": fresnel}
         wanted = {need.split("_")[0].lower() for need in entry.needs}
+        unused = {"masking": masking, "fresnel": fresnel}
+        refuse_unused(unused, wanted, f"integral {entry.name} does not depend on it, being {entry.about}")
         slots = {slot: chosen(slot, spec) for slot, spec in asked.items() if slot in wanted}
         provided = {f for choice in slots.values() for f in choice.model.provides}
         missing = [f for f in entry.needs if f not in provided and f.split("_")[0].lower() in slots]
@@ -299,6 +319,10 @@ def slots_of(
             )
     elif diffuse is None:
         raise UsageError(f"integral {entry.name} needs an ndf{', a diffuse model or a brdf' if albedo else ''}")
+    else:
+        refuse_unused(
+            {"masking": masking, "fresnel": fresnel}, (), "masking and fresnel are of an NDF, and none is given"
+        )
     if diffuse is not None:
         slots["diffuse"] = chosen("diffuse", diffuse)
     return slots
@@ -355,6 +379,8 @@ def grid_of(entry: Integral, slots: Mapping[str, Chosen], given: dict[str, Any],
     # Unknown names come before missing ones: a misspelt name is the reason why another is missing.
     for name in sorted(set(given) - {*known, *qualified_names}):
         raise UsageError(f"integral {entry.name} has no parameter {name!r}{_suggested(name, known)}")
+    if backfacing is not None and not entry.view:
+        raise UsageError(f"integral {entry.name} has no view direction: leave out backfacing")
     columns["NoV"] = np.ones(())
     columns["phi"] = np.zeros(())
     if entry.view:

@@ -30,6 +30,7 @@ from whitefurnace.integrals.quadrature import (
     climb_with_errors,
     grid_of,
     parts_of,
+    refuse_unused,
     room_for,
     room_for_errors,
     slots_of,
@@ -153,6 +154,8 @@ def _chosen(
 ) -> dict[str, Chosen]:
     """Return the models by slot; a perfectly smooth surface has its Fresnel term alone."""
     smooth = ndf is None and diffuse is None and brdf is None
+    if smooth:
+        refuse_unused({"masking": masking}, (), "a perfectly smooth surface masks nothing")
     slots = (
         {"fresnel": chosen("fresnel", fresnel)}
         if smooth

@@ -109,9 +109,8 @@ class Kind:
         """Return the light of the table. Raises UsageError for a light given to a kind that has none."""
         from whitefurnace.tables.cells import Lighting
 
-        for name in ("light", "environment", "normal"):
-            if getattr(request, name) is not None:
-                raise UsageError(f"integral {self.name} has no {name}; integral radiance has")
+        for name in request.lighting():
+            raise UsageError(f"integral {self.name} has no {name}; integral radiance has")
         return Lighting()
 
     # ------------------------------------------------------------------------------------------ axes

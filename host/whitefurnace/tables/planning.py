@@ -18,7 +18,7 @@ from whitefurnace.errors import UsageError, nearest
 from whitefurnace.files import check_table, stored_format
 from whitefurnace.integrals.api import integrate
 from whitefurnace.integrals.quadrature import DEFAULT_TOLERANCE, TableSpec, tolerances
-from whitefurnace.tables.axes import Axis, number, placed, size_of
+from whitefurnace.tables.axes import SIZES, Axis, Size, number, placed, size_of
 from whitefurnace.tables.cells import Cells
 from whitefurnace.tables.kind import Kind
 from whitefurnace.tables.kinds import kind as kind_of
@@ -136,6 +136,13 @@ def plan(request: TableRequest) -> TablePlan:
             raise UsageError(f"{name} is an option and no parameter; a model's own of that name is SLOT_{name}")
     view = integral(kind.integral(scheme)).view
     axes = kind.arranged(placed(kind.default_axes(size), size, view, models, given, fixed))
+    if request.backfacing is not None and not view:
+        raise UsageError(f"{kind.name} has no view direction: leave out backfacing")
+    if request.size is not None and request.for_ is None:
+        other = Size(size.across % SIZES[1] + 1, size.down % SIZES[1] + 1, size.both)
+        wanted = kind.with_usual_axes(request.axes or {}, models, fixed, other)
+        if axes == kind.arranged(placed(kind.default_axes(other), other, view, models, wanted, fixed)):
+            raise UsageError(f"size {request.size} changes nothing: every axis of this table has a count of its own")
     as_read = _check_axes(kind, path, axes, request)
     cells = Cells(models, axes, fixed, scheme, request.backfacing, kind.lighting(request))
     spec = kind.spec(cells)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -52,3 +52,10 @@ class TableRequest:
     for_: str | None = None
     force: bool = False
     parameters: Mapping[str, float | str] | None = None
+
+    def lighting(self) -> list[str]:
+        """Return the names of the given options that are of a light or an environment."""
+        usual = {field.name: field.default for field in fields(self)}
+        given = [name for name in ("light", "environment", "normal") if getattr(self, name) is not None]
+        reading = ("rotate", "exposure", "bad_pixels", "layout", "layer", "fill", "nonfinite")
+        return given + [name for name in reading if getattr(self, name) != usual[name]]

@@ -44,8 +44,8 @@ class Norm(Kind):
     def spec(self, cells: Cells) -> TableSpec:
         from whitefurnace.tables.curves import norm_check, shape_of_norm
 
-        found = super().spec(cells)
         norm_check(cells.models)
+        found = super().spec(cells)
         return replace(found, shape=shape_of_norm(cells.axes))
 
     def make(self, cells: Cells, run: Run, report: bool) -> tuple[Integrated, Facts]:

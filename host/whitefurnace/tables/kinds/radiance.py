@@ -36,10 +36,9 @@ class Radiance(OfIntegral):
         if (light is None) == (around is None):
             raise UsageError("integral radiance needs either a light or an environment")
         if light is not None:
-            if request.normal is not None or request.rotate or request.exposure:
-                raise UsageError(
-                    "normal, rotate and exposure are of an environment; a light lies in the surface's frame"
-                )
+            wrong = [name for name in request.lighting() if name != "light"]
+            if wrong:
+                raise UsageError(f"{wrong[0]} is of an environment; a light lies in the surface's frame")
             return Lighting({"light": chosen("light", light)})
         assert around is not None
         reading = Reading(

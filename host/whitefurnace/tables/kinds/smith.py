@@ -42,8 +42,8 @@ class Smith(Kind):
     def spec(self, cells: Cells) -> TableSpec:
         from whitefurnace.tables.curves import shape_of_smith, smith_check
 
-        found = super().spec(cells)
         smith_check(cells.models)
+        found = super().spec(cells)
         return replace(found, shape=shape_of_smith(cells.scheme, cells.axes))
 
     def make(self, cells: Cells, run: Run, report: bool) -> tuple[Integrated, Facts]:
