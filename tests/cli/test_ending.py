@@ -147,6 +147,29 @@ def test_a_signal_cleans_up_as_ctrl_c_does(tmp_path, device, name, signal_name, 
 
 
 @posix
+@pytest.mark.long
+@pytest.mark.parametrize("signal_name", ["SIGTERM", "SIGINT"])
+def test_a_kernel_without_end_keeps_no_signal_waiting(tmp_path, device, signal_name):
+    """Python's handlers wait for the driver's call to return, which a model that loops for hours does not let it do."""
+    (tmp_path / "loop.clh").write_text(
+        "real ndf_loop_D(real cos_m, real alpha) {\n  real s = alpha;\n"
+        "  for (int j = 0; j < 100000; j++) for (int i = 0; i < 1000000; i++) s = sqrt(s + cos_m);\n  return s;\n}\n"
+    )
+    made = ["lut", "normalization", "-o", tmp_path / "t.npy", "--ndf", tmp_path / "loop.clh", "--size", "4"]
+    run = subprocess.Popen(command(*made), stderr=subprocess.PIPE, text=True, start_new_session=True)
+    time.sleep(10)  # imports and the compiler are done by then; a signal before would end it too
+    assert run.poll() is None
+    number = signal.Signals[signal_name]
+    run.send_signal(number)
+    try:
+        complaint = run.communicate(timeout=30)[1]  # 5 s of patience, on a busy machine
+    finally:
+        run.kill()
+    assert run.returncode == 128 + number, complaint
+    assert complaint.splitlines()[-1].startswith(f"ended by {signal_name} while the device computed")
+
+
+@posix
 def test_a_signal_that_the_caller_ignores_is_ignored():
     """`nohup` ignores SIGHUP for what it starts."""
     code = (

@@ -11,6 +11,7 @@ import platform
 import re
 import shlex
 import signal
+import socket
 import sys
 import tempfile
 import threading
@@ -18,7 +19,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 
@@ -84,17 +85,61 @@ class Ended(BaseException):
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
+PATIENCE = 5.0
+"""Seconds that a driver may keep a signal waiting: a kernel that is slow ends in them, and one without end does not."""
+
+
+class _Watch:
+    """Ends this process after a signal that the main thread cannot hear, since a call of the driver does not return.
+
+    Python runs the handler of a signal in the main thread, and only between two of its own instructions. The number of
+    the signal is written to a socket at once, where a thread reads it.
+    """
+
+    def __init__(self) -> None:
+        self.heard = threading.Event()
+        self._numbers, self._written = socket.socketpair()
+        self._written.setblocking(False)  # signal.set_wakeup_fd needs that
+        self._before = signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
+        threading.Thread(target=self._run, daemon=True).start()
+
+    def _run(self) -> None:
+        while numbers := self._numbers.recv(1):
+            number = numbers[0]
+            # A handler that somebody else has set ends nothing here.
+            ours = getattr(signal.getsignal(number), "__module__", "") == __name__
+            if ours and not self.heard.wait(PATIENCE):
+                name = signal.Signals(number).name
+                say(f"ended by {name} while the device computed; the next run removes what this one left")
+                os._exit(128 + number)
+        self._numbers.close()
+
+    def close(self) -> None:
+        """Watch no longer."""
+        signal.set_wakeup_fd(self._before)
+        self.heard.set()
+        self._written.close()
+
 
 @contextlib.contextmanager
 def listening() -> Iterator[None]:
     """Raise `Ended` for SIGTERM and SIGHUP within the `with` block, where the caller does not ignore them.
 
     During an import the signal waits: an extension module that is interrupted while it starts reports another error.
+    While the driver computes it waits for `PATIENCE` seconds at most, as does Ctrl-C; then the process ends at once.
     """
 
     top = sys._getframe(2)
+    watch: _Watch | None = None
+
+    def interrupted(number: int, frame: FrameType | None) -> None:
+        if watch is not None:
+            watch.heard.set()
+        raise KeyboardInterrupt
 
     def heard(number: int, frame: FrameType | None) -> None:
+        if watch is not None:
+            watch.heard.set()
         if _imports(frame, top):
             again = threading.Timer(0.02, signal.raise_signal, [number])
             again.daemon = True
@@ -104,14 +149,20 @@ def listening() -> Iterator[None]:
             signal.signal(other, signal.SIG_IGN)
         raise Ended(number)
 
-    before = {}
+    before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread
         for number in SIGNALS:
             if signal.getsignal(number) == signal.SIG_DFL:
                 before[number] = signal.signal(number, heard)
+        if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+            before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupted)
+        if before:
+            watch = _Watch()
     try:
         yield
     finally:
+        if watch is not None:
+            watch.close()
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -131,10 +182,16 @@ def leave(code: int) -> NoReturn:
     sys.exit does not do: Python ends a process by SIGINT, whatever is asked, if the interrupt came inside an exec, as
     of a dataclass at import. It also waits for threads, and those of a driver may never end.
     """
-    with contextlib.suppress(BaseException):
-        atexit._run_exitfuncs()
+    last = threading.Thread(target=_run_exit_functions, daemon=True)
+    last.start()
+    last.join(PATIENCE)  # one of them waits for running kernels, which may never end
     close_streams()
     os._exit(code)
+
+
+def _run_exit_functions() -> None:
+    with contextlib.suppress(BaseException):
+        atexit._run_exitfuncs()
 
 
 # ---------------------------------------------------------------------------------------------- errors
