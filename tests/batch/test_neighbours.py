@@ -306,3 +306,9 @@ def test_any_name_works_and_only_its_line_is_not_in_the_depfile(tmp_path, shell,
     breaks = b"\n" in stem
     assert ("is left out" in shell.err) == breaks
     assert b"jobs/raw/" in rules and all(b":" in line for line in rules.splitlines())
+
+
+@pytest.mark.parametrize("name", ["two\nlines", "a\rb", "end\\"])
+def test_names_that_no_makefile_can_hold_are_refused(name):
+    with pytest.raises(InputError, match="which a Makefile cannot hold"):
+        batch.escaped(name)
