@@ -138,15 +138,15 @@ def plan(request: TableRequest) -> TablePlan:
     axes = kind.arranged(placed(kind.default_axes(size), size, view, models, given, fixed))
     if request.backfacing is not None and not view:
         raise UsageError(f"{kind.name} has no view direction: leave out backfacing")
+    as_read = _check_axes(kind, path, axes, request)
+    cells = Cells(models, axes, fixed, scheme, request.backfacing, kind.lighting(request))
+    spec = kind.spec(cells)
+    stored = _check_shape(kind, path, axes, spec.shape, request.stored)
     if request.size is not None and request.for_ is None:
         other = Size(size.across % SIZES[1] + 1, size.down % SIZES[1] + 1, size.both)
         wanted = kind.with_usual_axes(request.axes or {}, models, fixed, other)
         if axes == kind.arranged(placed(kind.default_axes(other), other, view, models, wanted, fixed)):
             raise UsageError(f"size {request.size} changes nothing: every axis of this table has a count of its own")
-    as_read = _check_axes(kind, path, axes, request)
-    cells = Cells(models, axes, fixed, scheme, request.backfacing, kind.lighting(request))
-    spec = kind.spec(cells)
-    stored = _check_shape(kind, path, axes, spec.shape, request.stored)
     return TablePlan(
         kind, path, cells, spec, request.precision, tolerance, relative, request.fit, as_read, stored, request.force
     )
