@@ -214,6 +214,23 @@ def test_the_environment_is_as_it_was(tmp_path, own):
     subprocess.run([sys.executable, "-c", code], env=environment, check=True, timeout=120)
 
 
+def test_a_limit_of_open_files_is_told_before_the_compiler_meets_it(tmp_path):
+    import resource
+
+    cache = opened(tmp_path)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    handle = os.open(os.devnull, os.O_RDONLY)  # the lowest number that is free
+    os.close(handle)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (handle + 4, before[1]))
+    try:
+        with pytest.raises(caches.DeviceError, match=r"more files \(ulimit -n\)"):
+            cache.check_room()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+    cache.check_room()
+    cache.close()
+
+
 def test_room_is_looked_at_where_the_folder_is(tmp_path, monkeypatch):
     cache = opened(tmp_path)
     cache.check_room()

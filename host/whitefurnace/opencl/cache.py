@@ -45,6 +45,9 @@ LEAST_ROOM = 16 << 20
 LEAST_FILE = 4 << 20
 """Size that a file of this process must be allowed to have: the largest source takes 1 MB after preprocessing."""
 
+LEAST_HANDLES = 12
+"""Files that this process must be allowed to open beside those that it has; with fewer than 8 PoCL aborts."""
+
 PATIENCE = 5.0
 """Seconds to wait for another process that cleans the folder, which takes milliseconds."""
 
@@ -178,6 +181,18 @@ class KernelCache:
                 f"files of this process may have {size(limit)} (ulimit -f), and the OpenCL compiler needs "
                 f"{size(LEAST_FILE)} in its kernel cache at {self.folder}"
             )
+        handles: list[int] = []
+        try:
+            while len(handles) < LEAST_HANDLES:
+                handles.append(os.open(os.devnull, os.O_RDONLY))
+        except OSError as error:
+            raise DeviceError(
+                f"this process may open only {len(handles)} more files (ulimit -n), and the OpenCL compiler needs "
+                f"{LEAST_HANDLES}"
+            ) from error
+        finally:
+            for handle in handles:
+                os.close(handle)
         with contextlib.suppress(OSError):
             room = os.statvfs(self.folder)
             free = room.f_bavail * room.f_frsize
