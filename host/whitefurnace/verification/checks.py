@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -574,7 +575,8 @@ def _chi2(b: Bench) -> Iterator[Row]:
                 for axis in "XY"
             ]
         )
-        m = sample(b.model, DRAWS, seed=crc32(b.model.name.encode()) + k, device=b.device, precision=b.precision, **own)
+        seed = crc32(os.fsencode(b.model.name)) + k
+        m = sample(b.model, DRAWS, seed=seed, device=b.device, precision=b.precision, **own)
         edges, share = _slope_energy(b, own, stretch)
         sx, sy = m[:, 0] / stretch[0], m[:, 1] / stretch[1]
         psi, phi = np.arctan2(np.hypot(sx, sy), m[:, 2]), np.arctan2(sy, sx) % (2 * math.pi)
