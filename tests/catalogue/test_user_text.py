@@ -92,9 +92,9 @@ def from_table(c: float) -> float:
             lambda c: 2 + 2 * c,
         ),
         (
-            "struct Lobe { float width, x; };\ntypedef struct { float scale; } Peak;\n"
+            "struct Lobe { float width, x, a; };\ntypedef struct { float scale; } Peak;\n"
             + HEAD
-            + "{ struct Lobe one = {1, 2}; Peak p; p.scale = one.width + one.x; return p.scale * cos_m; }",
+            + "{ struct Lobe one = {1, 1, 1}; Peak p; p.scale = one.width + one.x + one.a; return p.scale * cos_m; }",
             lambda c: 3 * c,
         ),
         (

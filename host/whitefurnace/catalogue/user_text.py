@@ -8,6 +8,7 @@ Lines stay where they were, so that a compiler's message names the line of the f
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -191,6 +192,13 @@ class UserText:
         self._types = set(_TYPES)
         self._functions: set[str] = set()
         self._variables: set[str] = set()
+        self._members = {
+            token.text
+            for n, opened in enumerate(self._solid)
+            if opened.text == "{" and {"struct", "union"} & {self._at(n - 1).text, self._at(n - 2).text}
+            for token in itertools.takewhile(lambda token: token.text != "}", self._solid[n + 1 :])
+            if token.kind == "name"
+        }
         self._note_declarations()
         self._replaced = self._arrays() | self._attributes()
 
@@ -383,7 +391,8 @@ class UserText:
         name, called = token.text, after.text == "("
         if before.text == ".":
             known = _COMPONENTS.fullmatch(name)
-            letters = str.maketrans("rgba", "xyzw") if known and set(name) <= set("rgba") else {}
+            colour = known and set(name) <= set("rgba") and name not in self._members
+            letters = str.maketrans("rgba", "xyzw") if colour else {}
             return name.translate(letters) if known else OWN + name
         if name in _TYPES:
             builds = called and name != "void" and self._at(n + 2).text != ")"
