@@ -19,6 +19,7 @@ from whitefurnace.catalogue import integral, model
 from whitefurnace.catalogue.choice import chosen
 from whitefurnace.catalogue.rule import AREA_RULES, LADDERS, Rule
 from whitefurnace.errors import UsageError, nearest
+from whitefurnace.integrals.quadrature import Part
 from whitefurnace.opencl import source
 from whitefurnace.opencl.derived import numbers_of
 from whitefurnace.opencl.device import Device
@@ -531,6 +532,15 @@ def _dfg(device: Device, precision: int, scale: int) -> Work:
     )
 
 
+def _albedo_with_kinks(device: Device, precision: int, scale: int) -> Work:
+    """The albedo of Cook-Torrance's masking, whose panels meet where its terms cross."""
+    names = {"ndf": "beckmann", "masking": "cook_torrance", "fresnel": "one"}
+    slots = {slot: model(slot, name) for slot, name in names.items()}
+    part = Part(device, integral("albedo"), slots, precision, kinked=True)
+    cells, terms, _ = part.cells(_cells((0.05, 1), (0.1, 1), count=2048 * scale), precision)
+    return _sum(device, part.text(terms), "integrate", cells, 1, precision, part.ladder[4])
+
+
 def _dfg_closed(device: Device, precision: int, scale: int) -> Work:
     slots = {"ndf": model("ndf", "ggx"), "masking": model("masking", "smith")}
     return _sum(
@@ -738,6 +748,7 @@ CASES = (
     Case("means", "overlap.cl", "texel", "exact means of a lat-long over the texels of a cube", _means, (64,)),
     Case("means-of-cube", "overlap.cl", "texel", "exact means of a turned cube over another", _means_of_cube, (64,)),
     Case("harmonics", "harmonics.cl", "node", "spherical harmonics to degree 2", _harmonics),
+    Case("albedo-with-kinks", "kinked.cl", "evaluation", "albedo of Cook-Torrance's masking", _albedo_with_kinks),
     Case("dfg", "integrate.cl", "evaluation", "split-sum pair, GGX with Smith's masking", _dfg),
     Case("dfg-closed", "dfg_ggx.cl", "evaluation", "split-sum pair, GGX, azimuth in closed form", _dfg_closed),
     Case("glass", "glass.cl", "evaluation", "reflected and refracted by a rough boundary, GGX", _glass),
