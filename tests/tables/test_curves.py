@@ -121,6 +121,18 @@ def test_norm_of_a_range_and_a_file(device: Device, tmp_path: Path) -> None:
     )
     k, own = np.linspace(1, 16, 7), macros(tmp_path / "l.h")["L_NORM"]
     assert np.abs(own(k) / ((k + 2) / (2 * np.pi)) - 1).max() <= made.manifest["error"] + 1e-5
+    # D = 1 + α c has the norm 1/(π + 2π α/3); its α follows the roughness of the axis.
+    (tmp_path / "bowl.clh").write_text("real ndf_bowl_D(real cos_m, real alpha) { return 1 + alpha * cos_m; }\n")
+    made = lut(
+        "norm",
+        tmp_path / "b.h",
+        ndf=str(tmp_path / "bowl.clh"),
+        axes={"roughness": (0.1, 1, 16)},
+        tolerance=1e-4,
+        device=device,
+    )
+    r, own = np.linspace(0.1, 1, 7), macros(tmp_path / "b.h")["B_NORM"]
+    assert np.abs(own(r) * (np.pi + 2 * np.pi * r**2 / 3) - 1).max() <= made.manifest["error"] + 1e-5
 
 
 def test_refusals(device: Device, tmp_path: Path) -> None:

@@ -298,7 +298,8 @@ def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, An
 
     def exact(share: Callable[[Axis], np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
         """Parameters and ln norm at shares of the axes, flat."""
-        given = {**ndf.given, **cells.columns_at([Points(axis.name, axis.at(share(axis))[0]) for axis in axes])}
+        points = [Points(axis.name, axis.at(share(axis))[0]) for axis in axes]
+        given = {**ndf.given, **cells.columns_at(points)}
         every = np.broadcast_arrays(
             *[
                 np.asarray(given.get(f"ndf_{p.name}", given.get(p.name, p.default)), np.float64)
@@ -308,8 +309,11 @@ def norm(cells: Cells, run: Run, report: bool) -> tuple[Integrated, dict[str, An
         rows = np.stack(
             [p.check(one, f"ndf {entry.name}").ravel() for p, one in zip(entry.parameters, every, strict=True)]
         )
-        names = [p.name for p in entry.parameters]
-        mine = [rows[names.index(axis.name.removeprefix("ndf_"))] for axis in axes]
+        # The variables of the polynomial are the axes: a roughness is one, though the NDF takes an α that follows it.
+        grids = np.meshgrid(
+            *(one.given for one in reversed(points)), indexing="ij"
+        )  # the first axis is the last dimension
+        mine = [grid.ravel() for grid in reversed(grids)]
         return mine, np.log(numbers_of(run.device, entry, rows)[which])
 
     spans = [Span.of(axis.name, axis.values()) for axis in axes]
