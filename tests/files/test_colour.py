@@ -600,6 +600,8 @@ def test_exposure_and_its_like_are_cumulative(tmp_path):
         ("EXPOSURE=nan", "over 0"),
         ("EXPOSURE=1e400", "over 0"),
         ("EXPOSURE=1 2", "a number over 0"),
+        ("EXPOSURE=1e20\nEXPOSURE=1e20", "outside [1e-30, 1e30]"),
+        ("EXPOSURE=1e-31", "outside [1e-30, 1e30]"),
         ("COLORCORR=1 1", "3 numbers"),
         ("COLORCORR=1 0 1", "3 numbers over 0"),
         ("PIXASPECT=x", "PIXASPECT"),

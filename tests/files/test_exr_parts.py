@@ -83,6 +83,11 @@ def test_what_is_no_light_is_refused_by_name(tmp_path, names):
     refused(path, "no layer of light", "data", "other")
 
 
+def test_colours_in_parts_of_their_own_are_not_taken_as_grey(tmp_path):
+    path = saved(tmp_path, *(Part({name: DEPTH}, f"beauty_{name}") for name in "RGB"))
+    refused(path, "beauty_R, beauty_G, beauty_B")
+
+
 def test_data_in_colours_is_light_only_when_asked_for(tmp_path):
     path = saved(tmp_path, Part(planes(OTHER), "normals"), Part({"Z": DEPTH}, "depth"))
     refused(path, "normals", "--layer")

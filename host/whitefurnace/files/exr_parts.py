@@ -181,6 +181,12 @@ def _first(path: Path, layers: Sequence[_Layer]) -> _Layer:
         light = [found for found in layers if found.light and getattr(found, kind)]
         if not light:
             continue
+        single = {next(iter(found.names)): found.of.name for found in layers if len(found.names) == 1}
+        if kind == "grey" and {"R", "G", "B"} <= single.keys():
+            raise InputError(
+                f"{path} has R, G and B in parts of their own ({_listed([single[name] for name in 'RGB'])}), one part "
+                "with all three was expected"
+            )
         first = [found for found in light if found.part == light[0].part]
         plain = next((found for found in first if not found.name), None)
         if plain is not None or len(first) == 1:

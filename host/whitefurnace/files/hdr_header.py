@@ -149,8 +149,12 @@ def _encoding(lines: list[bytes], path: Path) -> tuple[Encoding | None, tuple[st
         elif name == b"PRIMARIES":
             primaries = _numbers(value, 8, "PRIMARIES", path)
     scale = exposure * correction
-    if not (np.all(np.isfinite(scale)) and np.all(scale > 0) and 0.01 <= gamma <= 100):
-        raise InputError(f"{path} states a product of EXPOSURE, COLORCORR or GAMMA that is out of range")
+    # Beyond these no pixel stays between 0 and infinity in float32; real exposures are within 1e±6.
+    if not (np.all((scale >= 1e-30) & (scale <= 1e30)) and 0.01 <= gamma <= 100):
+        raise InputError(
+            f"{path} states a product of EXPOSURE and COLORCORR that is outside [1e-30, 1e30] or of GAMMA outside "
+            "[0.01, 100]"
+        )
     notices = []
     if exposure != 1:
         notices.append(f"{path}: divided by its EXPOSURE of {exposure:g} in all")
