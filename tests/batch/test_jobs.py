@@ -523,6 +523,19 @@ def test_a_lock_is_held_once_and_leaves_nothing(tmp_path):
     lock.release()
 
 
+@pytest.mark.skipif(os.name != "posix", reason="an open file stays on Windows")
+def test_a_signal_while_a_lock_is_taken_leaves_no_file(tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("whitefurnace.files.lock._left", interrupted)
+    for text, stays in (("", False), ("not a lock", True)):
+        (tmp_path / ".a.lock").write_text(text)
+        with pytest.raises(KeyboardInterrupt):
+            acquire(tmp_path / ".a.lock")
+        assert (tmp_path / ".a.lock").exists() == stays
+
+
 def test_a_lock_whose_file_was_removed_is_no_lock(tmp_path, monkeypatch):
     """Who opened the file before its holder removed it locks a file without a name, while a third makes a new one."""
     from whitefurnace.files import lock as locks

@@ -139,7 +139,13 @@ def acquire(
             if _try(handle) and _same(handle, path):
                 left = tuple(name for name in _left(path, handle) if own is None or own(name))
                 return Lock(path, handle, left, waited)
-        except BaseException:
+        except BaseException as error:
+            # A signal here must not leave the empty file that was made above. A file with content stays: it is
+            # somebody else's, or names what a killed holder left.
+            with contextlib.suppress(OSError):
+                empty = not isinstance(error, Exception) and os.fstat(handle).st_size == 0
+                if empty and _try(handle) and _same(handle, path):
+                    path.unlink()
             os.close(handle)
             raise
         os.close(handle)
