@@ -109,7 +109,7 @@ def test_every_model_of_an_integral_counts(name: str, slot: str, tmp_path: Path)
         {"name": "radiance", "light": "ambient:radiance=1", "masking": "kelemen", "NoV": 0.5},
         {"name": "radiance", "light": "ambient:radiance=1", "ndf": "ggx", "normal": np.array([0, 1, 0]), "NoV": 0.5},
     ],
-    ids=str,
+    ids=lambda given: "-".join(given),
 )
 def test_what_an_integral_would_ignore_is_refused(given: dict[str, Any]) -> None:
     with pytest.raises((UsageError, UnsupportedError)) as caught:
