@@ -271,6 +271,11 @@ class _Images:
         self._buffers = take.array(document.get("buffers", []), "buffers", 0, MAX_IMAGES)
         self._faces: dict[tuple[int, int], Level] = {}
         self._loaded: dict[int, memoryview] = {}
+        for thing, listed in (("image", self._images), ("buffer", self._buffers)):
+            for k, one in enumerate(listed):
+                if isinstance(one, dict) and _climbs(one.get("uri")):
+                    # Nothing would be read through it, yet a file that tries is not one to trust.
+                    raise self._outside(_decoded_name(one["uri"]), f"{thing} {k}")
 
     def face(self, index: Any, side: int, what: str) -> Level:
         """Return image `index` as a face of side x side texels; `what` names the face in error messages."""
@@ -347,13 +352,31 @@ class _Images:
         uri = self._take.text(value, f"the uri of {what}")
         if uri[: len(_DATA)].lower() == _DATA:
             return {}
-        name = os.fsdecode(unquote_to_bytes(uri.encode("utf-8", "surrogatepass")))
+        name = _decoded_name(uri)
         try:
             if self._folder is None:
                 raise ValueError
             path = inside(self._folder, name)
         except ValueError:
-            raise self._source.wrong(
-                f"the uri of {what}, {plain_name(name)!r}, is not a file in the folder of the glTF"
-            ) from None
+            raise self._outside(name, what) from None
         return {os.path.normpath(name): path}
+
+    def _outside(self, name: str, what: str) -> WhitefurnaceError:
+        return self._source.wrong(f"the uri of {what}, {plain_name(name)!r}, is not a file in the folder of the glTF")
+
+
+def _decoded_name(uri: str) -> str:
+    """Return the name of a file in a URI, with its percent signs decoded."""
+    return os.fsdecode(unquote_to_bytes(uri.encode("utf-8", "surrogatepass")))
+
+
+def _climbs(uri: Any) -> bool:
+    """Return whether a URI is a relative name that leads out of its folder by `..`."""
+    if not isinstance(uri, str) or uri[: len(_DATA)].lower() == _DATA:
+        return False
+    depth = 0
+    for part in _decoded_name(uri).replace("\\", "/").split("/"):
+        depth += {"..": -1, ".": 0, "": 0}.get(part, 1)
+        if depth < 0:
+            return True
+    return False
