@@ -788,6 +788,14 @@ def test_astc_codes_what_is_given():
         assert astc.decode_astc(noise.randbytes(64), (7, 8)).shape == (7, 8, 4)
 
 
+def test_astc_leaves_strings_as_they_are():
+    """astc-encoder writes capitals into the string of channels that it is given, and equal literals are one object."""
+    pytest.importorskip("astc_encoder")
+    order = "rgba"
+    astc.decode_astc(astc.encode_astc(np.ones((4, 4, 4), np.float32)).data.tobytes(), (4, 4))
+    assert [ord(letter) for letter in order] == [0x72, 0x67, 0x62, 0x61]
+
+
 def test_astc_without_its_library_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "astc_encoder", None)
     with pytest.raises(UnsupportedError, match=r'pip install "whitefurnace\[astc\]"'):

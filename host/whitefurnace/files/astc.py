@@ -15,6 +15,10 @@ QUALITY = 98.0
 """astcenc's preset `-thorough`."""
 
 
+# astc-encoder turns the string that it is given into capitals in place, and with it every equal literal of the process.
+_RGBA, _RGB1 = "RGBA", "RGB1"
+
+
 def encode_astc(values: npt.ArrayLike, *, quality: float = QUALITY) -> Packed:
     """Encode `values` (..., height, width, 3 | 4) as ASTC HDR blocks: uint8 (..., blocks down, blocks across, 16).
 
@@ -34,7 +38,7 @@ def encode_astc(values: npt.ArrayLike, *, quality: float = QUALITY) -> Packed:
     halves = pack("rgba16f", np.maximum(array, 0))  # NaN stays NaN and is refused
     height, width = array.shape[-3:-1]
     context = _context(astc, quality, 0)
-    swizzle = astc.ASTCSwizzle.from_str("rgba" if array.shape[-1] == 4 else "rgb1")
+    swizzle = astc.ASTCSwizzle.from_str(_RGBA if array.shape[-1] == 4 else _RGB1)
     blocks = [
         context.compress(astc.ASTCImage(astc.ASTCType.F16, width, height, 1, image.tobytes()), swizzle)
         for image in halves.data.reshape(-1, height, width, 8)
@@ -56,7 +60,7 @@ def decode_astc(data: bytes | memoryview, shape: tuple[int, ...]) -> npt.NDArray
     if not len(blocks) or len(blocks) % size:
         raise ValueError(f"{len(blocks)} bytes are not {shape} texels of astc4x4hdr")
     context = _context(astc, 0, astc.ASTCConfigFlags.DECOMPRESS_ONLY)
-    swizzle = astc.ASTCSwizzle.from_str("rgba")
+    swizzle = astc.ASTCSwizzle.from_str(_RGBA)
     out = np.empty((len(blocks) // size, height, width, 4), np.float32)
     for k in range(len(out)):
         image = astc.ASTCImage(astc.ASTCType.F16, width, height)
