@@ -141,7 +141,7 @@ def listening() -> Iterator[None]:
         if watch is not None:
             watch.heard.set()
         if _imports(frame, top):
-            again = threading.Timer(0.02, signal.raise_signal, [number])
+            again = threading.Timer(0.02, _signal_main_thread, [number])
             again.daemon = True
             again.start()
             return
@@ -165,6 +165,14 @@ def listening() -> Iterator[None]:
             watch.close()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _signal_main_thread(number: int) -> None:
+    """Send a signal to the main thread itself, whose sleep or wait it then interrupts; another thread's would not."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
+    else:
+        signal.raise_signal(number)
 
 
 def _imports(frame: FrameType | None, top: FrameType) -> bool:
