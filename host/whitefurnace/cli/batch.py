@@ -298,12 +298,13 @@ def failures_text(summary: Summary) -> list[str]:
 def summary_text(summary: Summary) -> str:
     """Return the summary of a batch in one line."""
     states = {"done": "done", "planned": "to do", "skipped": "up to date", "failed": "failed"}
+    items = "1 item" if summary.total == 1 else f"{summary.total} items"
     if summary.total and summary.states["skipped"] == summary.total:
-        return f"{summary.total} items, all up to date: nothing to do; {summary.wall:.2f} s"
+        return f"{items}, all up to date: nothing to do; {summary.wall:.2f} s"
     counts = [f"{summary.states[state]} {text}" for state, text in states.items() if summary.states[state]]
     left = summary.total - summary.count
     counts += [f"{left} not begun"] if left else []
-    line = f"{summary.total} items: {', '.join(counts) or 'none'}; {size(summary.nbytes)}"
+    line = f"{items}: {', '.join(counts) or 'none'}; {size(summary.nbytes)}"
     if summary.states["planned"]:
         return (
             line + f", about {summary.predicted['cpu_seconds']:.2g} s of processor time, "

@@ -662,11 +662,8 @@ class Totals:
 
     def notices(self) -> tuple[str, ...]:
         """Return a sentence about promoted cells, or nothing where there are none."""
-        return (
-            (f"{self.promoted} cells were done in float64: float32 did not reach the tolerance there",)
-            if self.promoted
-            else ()
-        )
+        many = "1 cell was" if self.promoted == 1 else f"{self.promoted} cells were"
+        return (f"{many} done in float64: float32 did not reach the tolerance there",) if self.promoted else ()
 
 
 def climb(

@@ -68,7 +68,9 @@ def clean(
         faces[bad & ~infinite] = 0
         count = int(np.count_nonzero(infinite))
         if count:
-            notices.append(f"{where}: {_many(count, '+inf')} set to {largest:.6g}, the largest of its pixels")
+            # Sums of such floats leave float32, so that no level can meet a tolerance.
+            hint = "; give --exposure -20 too, or --sun clamp=N" if largest > 1e30 else ""
+            notices.append(f"{where}: {_many(count, '+inf')} set to {largest:.6g}, the largest of its pixels{hint}")
         if rest := int(np.count_nonzero(bad)) - count:
             notices.append(f"{where}: {_many(rest, 'not finite')} set to 0")
     bad = (faces < 0) & (angles > 0)
