@@ -298,8 +298,8 @@ def test_real_environments(environments, number):
 
 @pytest.mark.long
 def test_the_demo(tmp_path):
-    from whitefurnace.baking.bake import demo
     from whitefurnace.opencl.device import choose_device
+    from whitefurnace.sphere.environments import demo
 
     write_exr(tmp_path / "demo.exr", demo(choose_device(None)).texels)
     check_real(tmp_path / "demo.exr", 200)

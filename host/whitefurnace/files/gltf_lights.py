@@ -30,7 +30,7 @@ from whitefurnace.files.binary import MAX_BYTES, Source, load
 from whitefurnace.files.inputs import inside, plain_name
 from whitefurnace.files.jsontext import Reader, parse_object
 from whitefurnace.files.rgbd import MAX_SIZE, Level, check_chain, decode_face, encode_faces
-from whitefurnace.text import printable
+from whitefurnace.text import shortened
 
 NAME = "EXT_lights_image_based"
 GLB_MAGIC = b"glTF"
@@ -345,7 +345,7 @@ class _Images:
         try:
             return load(path).view
         except WhitefurnaceError as error:  # the name may hold line breaks
-            raise type(error)(printable(str(error))) from None
+            raise type(error)(shortened(str(error), 300)) from None
 
     def _place(self, value: Any, what: str) -> dict[str, Path]:
         """Return the file of a URI by its name relative to the folder of the glTF; empty for a data URI."""

@@ -98,8 +98,10 @@ def _share(faces: npt.NDArray[np.float32], bad: npt.NDArray[np.bool_], angles: n
         some = angles if angles.shape[1] == 1 else angles[:, rows]
         for k, part in enumerate((slice(0, 3), slice(3, 4))):
             values, wrong = faces[:, rows, :, part], bad[:, rows, :, part]
-            taken[k] -= float((values * some)[wrong].sum())
-            kept[k] += float((values * some)[values > 0].sum())
+            with np.errstate(invalid="ignore"):  # values that no face covers may be infinite, and their angle is 0
+                energy = values * some
+            taken[k] -= float(energy[wrong].sum())
+            kept[k] += float(energy[(values > 0) & (some > 0)].sum())
     return max(float(t / k) if k > 0 else np.inf for t, k in zip(taken, kept, strict=True) if t > 0)
 
 
