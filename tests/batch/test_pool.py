@@ -635,8 +635,8 @@ def test_the_cores_are_divided_among_the_workers(monkeypatch):
 # ------------------------------------------------------------------------------ Dask's own
 
 
-@pytest.fixture
-def scheduler(tmp_path):
+@contextlib.contextmanager
+def started(folder: Path, *options: str):
     """A scheduler and one worker, each a process of its own that may be killed: (address, scheduler, worker)."""
     pytest.importorskip("distributed")
     code = (
@@ -661,21 +661,28 @@ def scheduler(tmp_path):
             "4",
             "--no-nanny",
             "--no-dashboard",
-            "--resources",
-            "OPENCL=1",
             "--local-directory",
-            str(tmp_path / "dask"),
+            str(folder / "dask"),
             "--death-timeout",
             "5",
+            *options,
         ],
         stdout=subprocess.DEVNULL,
         env={**os.environ, "PYTHONPATH": path},
         **quiet,
     )
-    yield address, first, second
-    for process in (first, second):
-        process.kill()
-        process.wait()
+    try:
+        yield address, first, second
+    finally:
+        for process in (first, second):
+            process.kill()
+            process.wait()
+
+
+@pytest.fixture
+def scheduler(tmp_path):
+    with started(tmp_path, "--resources", "OPENCL=1") as found:
+        yield found
 
 
 @pytest.mark.parametrize("count", [5, 20], ids=["all submitted", "more to come"])
@@ -791,24 +798,15 @@ def test_a_cluster_with_tls(tmp_path):
     assert {result.state for result in found.values()} == {"done"}
 
 
-def test_a_cluster_without_the_resource_is_waited_for_and_told():
-    distributed = pytest.importorskip("distributed")
+def test_a_cluster_without_the_resource_is_waited_for_and_told(tmp_path):
     told, stop = [], threading.Event()
 
     def notice(text):
         told.append(text)
         stop.set()
 
-    with distributed.LocalCluster(
-        n_workers=1,
-        threads_per_worker=1,
-        processes=False,
-        dashboard_address=":0",
-        protocol="tcp",
-        host="127.0.0.1",
-        scheduler_port=0,
-    ) as local:
-        assert collect([Job("a")], scheduler=local.scheduler_address, on_notice=notice, stop=stop) == {}
+    with started(tmp_path) as (address, *_):
+        assert collect([Job("a")], scheduler=address, on_notice=notice, stop=stop) == {}
     assert len(told) == 1 and "declares OPENCL=1" in told[0]
 
 
